@@ -37,13 +37,14 @@ class Choice(NamedTuple):
 
 def choose_sampler(model: Model, chains: int, tune: int) -> Choice:
     """The sampler that takes less time, of those that are able to sample the model."""
-    if reason := why_no_nuts(model):
+    if reason := _obstacle(model):
         return Choice(DRAM, reason)
-    point = model.initial_point(random_seed=0)
-    dim = sum(np.size(point[value.name]) for value in model.value_vars)
+    dim = _initial_position(model).size
     cost = seconds_per_evaluation(model)
     seconds = {name: expected_seconds(name, dim, cost, chains, tune) for name in (DRAM, NUTS)}
     quicker = min(seconds, key=lambda name: seconds[name])
+    if quicker == NUTS and (reason := _missing_gradient(model)):
+        return Choice(DRAM, reason)
     return Choice(
         quicker,
         f"{dim} parameters and {1e3 * cost:.2g} ms a log-density: about {seconds[DRAM]:.2g} CPU s "
@@ -62,10 +63,16 @@ def expected_seconds(sampler: str, dim: int, cost: float, chains: int, tune: int
 
 def why_no_nuts(model: Model) -> str:
     """What keeps NUTS from sampling a model; empty if nothing does."""
+    return _obstacle(model) or _missing_gradient(model)
+
+
+def _obstacle(model: Model) -> str:
     if noisy := list(noisy_filters(model)):
         return f"the likelihood of {noisy[0]!r} is estimated with noise"
-    if obstacle := gradient_obstacle(model):
-        return obstacle
+    return gradient_obstacle(model)
+
+
+def _missing_gradient(model: Model) -> str:
     try:
         pytensor.grad(model.logp(), [model.rvs_to_values[rv] for rv in model.free_RVs])
     except (NotImplementedError, TypeError, ValueError) as error:
@@ -73,11 +80,14 @@ def why_no_nuts(model: Model) -> str:
     return ""
 
 
+def _initial_position(model: Model) -> np.ndarray:
+    point = model.initial_point(random_seed=0)
+    return np.concatenate([np.ravel(point[model.rvs_to_values[rv].name]) for rv in model.free_RVs])
+
+
 def seconds_per_evaluation(model: Model) -> float:
     """CPU seconds that the log-density takes at the model's initial point."""
-    density = ModelDensity(model)
-    point = model.initial_point(random_seed=0)
-    x = np.concatenate([np.ravel(point[model.rvs_to_values[rv].name]) for rv in model.free_RVs])
+    density, x = ModelDensity(model), _initial_position(model)
     density.evaluate(x[None])  # loads the machine code
     n = 1
     while True:  # more points for a short one, so that what Python takes does not count

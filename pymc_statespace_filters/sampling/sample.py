@@ -10,6 +10,7 @@ from pymc.model import Model
 from xarray import DataTree
 
 from ..errors import ModelError
+from ..pymc_model.density import check_free_variables
 from ..pymc_model.inspection import given_model
 from .checkpoint.checkpoint import checked_folder
 from .choice import DRAM, NUTS, Choice, choose_sampler, why_no_nuts
@@ -121,6 +122,7 @@ def sample(
     ((4, 500), 'dram')
     """
     model = given_model(model)
+    check_free_variables(model)
     choice = _choice(
         model,
         sampler,

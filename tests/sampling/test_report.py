@@ -9,9 +9,10 @@ import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.sampling.run import model_task
 from tests.kernels import with_kernel
 from tests.sampling.test_dram import nan_beyond, simple_model
-from tests.sampling.test_sample_dram import LOGGER, sample_dram
+from tests.sampling.test_sample_dram import LOGGER, sample_dram, state_space_model
 
 
 @pytest.fixture
@@ -157,3 +158,18 @@ def test_models_are_named(caplog):
     with caplog.at_level(logging.DEBUG, logger=LOGGER):
         psf.run_models({"one": simple_model()}, draws=50, tune=50, chains=2, progressbar=False)
     assert any(text.startswith("Model 'one': 2 chains of 50 draws") for text in caplog.messages)
+
+
+def test_chains_below_what_the_search_has_met_never_reached_the_posterior(report_of, monkeypatch):
+    """Told once, whatever else follows from it; not of estimates, which may be far too high."""
+    set_population = model_task.ModelTask.set_population
+
+    def higher(task, found):
+        set_population(task, found._replace(highest=found.highest + 100.0))
+
+    monkeypatch.setattr(model_task.ModelTask, "set_population", higher)
+    _, _, messages = report_of(simple_model(), draws=50, tune=400)
+    (said,) = messages[:-1]
+    assert re.match(r"The chains never reached the posterior: .* stayed 10\d nats", said)
+    _, _, messages = report_of(state_space_model(psf.BootstrapPF(200)), draws=50, tune=400)
+    assert "never reached" not in "".join(messages)

@@ -240,6 +240,16 @@ def test_refusals(changes, message):
         sample(model=linear_model(3), **changes, progressbar=False)
 
 
+def test_a_model_without_continuous_variables():
+    with pm.Model() as empty:
+        pm.Normal("y", observed=1.0)
+    with pm.Model() as counts:
+        pm.Poisson("n", 3)
+    for model, message in ((empty, "at least one free variable"), (counts, "discrete")):
+        with pytest.raises(psf.errors.ModelError, match=message):
+            sample(model=model, progressbar=False)
+
+
 def test_nuts_refuses_noise():
     with pytest.raises(psf.errors.ModelError, match=r"sampler must be 'dram' .* 'd0' is estimated"):
         sample(model=state_space_model(psf.BootstrapPF(10)), sampler="nuts", progressbar=False)
