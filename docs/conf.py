@@ -13,6 +13,7 @@ sys.path.insert(0, str(HERE))
 
 from pymc_statespace_filters import DRAM  # noqa: E402
 
+import local_traces  # noqa: E402
 import notebook_cache  # noqa: E402
 import page_order  # noqa: E402
 import reference_pages  # noqa: E402
@@ -89,3 +90,4 @@ def setup(app: Sphinx) -> None:
     notebook_cache.prepare(Path(nb_execution_cache_path))
     app.connect("env-before-read-docs", page_order.spread_notebooks)
     app.connect("build-finished", notebook_cache.report_failures)
+    app.connect("build-finished", local_traces.report)

@@ -186,11 +186,12 @@ def _directive(name: str, option: str, entries: Sequence[str]) -> str:
 def _page(name: str) -> str:
     value = _value(name)
     kind = "autoclass" if inspect.isclass(value) else "autofunction"
+    module, _, last = f"{PACKAGE}.{name}".rpartition(".")
     lines = [
         _heading(name, "="),
-        f".. currentmodule:: {PACKAGE}",
+        f".. currentmodule:: {module}",
         "",
-        f".. {kind}:: {name}",
+        f".. {kind}:: {last}",
     ]
     if name in MEMBERS:
         lines += [f"   :members: {MEMBERS[name]}"]

@@ -104,6 +104,20 @@ def test_notebooks_run_again_if_the_package_has_changed(guide, first):
     assert len(list((guide / ".cache" / "notebooks").iterdir())) == 1
 
 
+def test_pages_that_show_the_machine_are_named(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    local_traces = import_module("local_traces")
+    (tmp_path / "howto").mkdir()
+    (tmp_path / "index.html").write_text("<p>Nothing of it</p>")
+    (tmp_path / "howto" / "bad.html").write_text(
+        "<pre>/home/me/lib/site-packages/rich/live.py:260: UserWarning: install ipywidgets</pre>"
+    )
+    traces = ("/home/me", "/other", *local_traces.TRACES)
+    assert list(local_traces.found(tmp_path, traces)) == [
+        ("howto/bad.html", ["/home/me", "site-packages", "ipywidgets"])
+    ]
+
+
 def test_each_process_has_its_share_of_the_notebooks(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "docs")
     page_order = import_module("page_order")

@@ -39,10 +39,10 @@ def run_code_of(*pages: str) -> dict:
 
 
 def test_the_example(capsys: pytest.CaptureFixture) -> None:
-    """Twelve statements, and the probability that the text tells."""
+    """Thirteen statements, and the probability that the text tells."""
     names = run_code_of("README.md")
     statements = [n for n in ast.walk(ast.parse(code_of("README.md"))) if isinstance(n, ast.stmt)]
-    assert len(statements) == 12
+    assert len(statements) == 13
     assert list(names["fits"]) == ["one well", "two wells"]
     rows = capsys.readouterr().out.splitlines()
     (probability,) = (row.split()[2] for row in rows if row.startswith("two wells"))

@@ -33,7 +33,8 @@ _WITHOUT_STATE = (
     "numbers unless shapes= says otherwise"
 )
 _HOW_TO_WRITE = (
-    "Write it with pytensor.tensor operations (pt.exp, pt.switch, ...) instead of numpy or if"
+    "Write it with pytensor.tensor operations: pt.switch instead of if or np.where, pt.stack "
+    "instead of np.array"
 )
 # What has a row for each state, whose number is that of the initial mean.
 ROWS_ARE_STATES = ("transition", "drift", "diffusion", "A", "B", "offset")

@@ -149,7 +149,7 @@ def test_potentials_and_several_observed_variables_count():
 def test_too_few_near_the_centre_is_a_warning(regression_model):
     with (
         pytest.warns(EvidenceWarning, match="chains disagree"),
-        pytest.warns(EvidenceWarning, match=r"worth \d+ independent ones, fewer than 100"),
+        pytest.warns(EvidenceWarning, match=r"effective number of \d+, fewer than 100"),
     ):
         found = chib_jeliazkov(
             exact_draws((2, 100), 0.95), regression_model, random_seed=1, n_proposals=400

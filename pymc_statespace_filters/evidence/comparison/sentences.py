@@ -120,8 +120,7 @@ def _approximate(evidences: Mapping[str, Evidence]) -> Iterator[str]:
         return
     of_whom = "all models" if len(names) == len(evidences) > 1 else _names(names)
     yield (
-        f"The likelihood of {of_whom} is a filter's approximation, neither exact nor unbiased; se "
-        "excludes its error."
+        f"The likelihood of {of_whom} is a filter's approximation; se does not include its error."
     )
 
 

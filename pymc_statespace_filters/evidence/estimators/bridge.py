@@ -275,7 +275,7 @@ def _check(n_effective: float, se_draws: float, se_proposals: float, gap: float)
     """Check the effective sample size, both errors and the gap between the halves."""
     if n_effective < MIN_EFFECTIVE:
         yield (
-            f"the draws are worth {n_effective:.0f} independent ones, fewer than "
+            f"the draws have an effective number of {n_effective:.0f}, fewer than "
             f"{MIN_EFFECTIVE}: draw more"
         )
     if max(se_draws, se_proposals) > MAX_ERROR:

@@ -236,12 +236,12 @@ def _of_one_block(folds: Sequence[OneBlockEstimate]) -> Estimate:
     doubts = []
     if numerator < MIN_EFFECTIVE:
         doubts.append(
-            f"the draws near the central point are worth {numerator:.0f} independent ones, "
+            f"only {numerator:.0f} effective draws lie near the central point, "
             f"fewer than {MIN_EFFECTIVE}: draw more"
         )
     if denominator < MIN_EFFECTIVE:
         doubts.append(
-            f"the proposals are worth {denominator:.0f} independent ones, fewer than "
+            f"the proposals have an effective number of {denominator:.0f}, fewer than "
             f"{MIN_EFFECTIVE}: raise n_proposals, or reparametrise towards a Gaussian posterior"
         )
     settings = {
@@ -261,8 +261,8 @@ def _of_blocks(folds: Sequence[BlockEstimate], n_blocks: int, n_proposals: int) 
     doubts = []
     if effective < MIN_EFFECTIVE:
         doubts.append(
-            f"the worst run is worth {effective:.0f} independent draws, fewer than "
-            f"{MIN_EFFECTIVE}: raise n_proposals and draw more, or reparametrise towards a "
+            f"the weakest of the separate estimates rests on {effective:.0f} effective draws, fewer "
+            f"than {MIN_EFFECTIVE}: raise n_proposals and draw more, or reparametrise towards a "
             "Gaussian posterior"
         )
     if n_moves < MIN_MOVES:

@@ -114,7 +114,7 @@ def _check(n_effective: float, tail: float, unsampled: float, error: float) -> I
         )
     if n_effective < MIN_EFFECTIVE:
         yield (
-            f"the proposals are worth {n_effective:.0f} independent draws, fewer than "
+            f"the proposals have an effective number of {n_effective:.0f}, fewer than "
             f"{MIN_EFFECTIVE}: use bridge sampling, or reparametrise towards a Gaussian posterior"
         )
     if not tail <= MAX_PARETO_K:

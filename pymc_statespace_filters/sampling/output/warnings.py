@@ -232,7 +232,7 @@ def _mobility_problem(statistics: PhaseStatistics, *, is_noisy: bool) -> str | N
             )
         return (
             f"DRAM stayed at one point for {statistics.longest_dwell} of {n} iterations. {begin} "
-            "proposals do not lead away from there: tune longer, start elsewhere (initvals), or "
+            "proposals from there were not accepted: tune longer, start elsewhere (initvals), or "
             "give proposal_cov."
         )
     return None
