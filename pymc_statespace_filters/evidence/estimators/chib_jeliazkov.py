@@ -262,8 +262,8 @@ def _of_blocks(folds: Sequence[BlockEstimate], n_blocks: int, n_proposals: int) 
     if effective < MIN_EFFECTIVE:
         doubts.append(
             f"the weakest of the separate estimates rests on {effective:.0f} effective draws, "
-            f"fewer than {MIN_EFFECTIVE}: raise n_proposals and draw more, or reparametrise towards a "
-            "Gaussian posterior"
+            f"fewer than {MIN_EFFECTIVE}: raise n_proposals and draw more, or reparametrise "
+            "towards a Gaussian posterior"
         )
     if n_moves < MIN_MOVES:
         doubts.append(
