@@ -89,6 +89,7 @@ GROUPS = {
         "plot_states",
         "plot_forecast",
         "plot_phase",
+        "plot_predictive",
         "plot_residuals",
         "plot_filter_health",
         "plot_evidence",

@@ -1,10 +1,13 @@
 """Sequential log-likelihood terms at every draw, each with the noise of its own estimate."""
 
+import warnings
+from collections.abc import Sequence
+
 import numpy as np
 import pymc as pm
 import xarray as xr
 
-from ..errors import ModelError
+from ..errors import EvidenceWarning, ModelError
 from ..pymc_model.inspection import given_model
 from ..pymc_model.state_graphs import StateSpaceVariable, terms_of
 from ..states.draws import PosteriorDraws, select_draws
@@ -37,8 +40,8 @@ def compute_log_likelihood(
     The terms :math:`\log p(d_j \mid d_1 \dots d_{j-1}, \theta)` are **sequential**: each is
     conditional on all earlier observations. `leave_future_out` uses them. ``az.loo``, and with it
     ``az.compare`` of DataTrees, is invalid with them, because the terms of later observations
-    depend on the observation that is left out. ArviZ does not warn; ``elpd_i`` of its pointwise
-    result has the attribute ``terms``, which says so.
+    depend on the observation that is left out. ArviZ does not warn; this function does, and
+    ``elpd_i`` of a pointwise result has the attribute ``terms``, which says so.
 
     The terms of a **panel** are summed by record. With these sums ``az.loo`` leaves out whole
     records, and is valid: records are independent given the parameters. Records with parameters of
@@ -73,6 +76,11 @@ def compute_log_likelihood(
         If draws and model are inconsistent, or the chain moved its noise (``correlation``), so that
         no seed reproduces the estimates.
 
+    Warns
+    -----
+    EvidenceWarning
+        That the terms of a variable without a panel are not those that ``az.loo`` needs.
+
     Examples
     --------
     >>> import pymc as pm
@@ -88,27 +96,41 @@ def compute_log_likelihood(
     >>> with pm.Model() as model:
     ...     a = pm.Normal("a", 0, 0.5)
     ...     d = psf.StateSpace(
-    ...         "d", system, psf.BootstrapPF(50), steps=[0, 1, 2], observed=[0.3, 1.2, 0.4]
+    ...         "d", system, psf.EKF(), panel=["A", "A", "B"], steps=[0, 1, 2],
+    ...         observed=[0.3, 1.2, 0.4],
     ...     )
     ...     idata = psf.sample_dram(100, tune=100, chains=2, random_seed=1, progressbar=False)
     ...     terms = psf.compute_log_likelihood(idata)["log_likelihood"]["d"]
     >>> dict(terms.sizes)
-    {'chain': 2, 'draw': 100, 'd_time': 3}
+    {'chain': 2, 'draw': 100, 'd_record': 2}
     """
     model = given_model(model)
-    draws = select_draws(idata, None)
+    draws, variables = select_draws(idata, None), select_variables(model, var_name)
+    _warn_of_sequence([one.name for one in variables if not one.is_panel])
     found = xr.merge(
         [
             (_terms_of_records if variable.is_panel else sequential_terms)(
                 model, variable, draws, progressbar=progressbar
             ).to_dataset()
-            for variable in select_variables(model, var_name)
+            for variable in variables
         ]
     )
     if extend_inferencedata and "log_likelihood" in idata.children:
         present = idata["log_likelihood"].to_dataset()
         found = found.merge(present[[name for name in present.data_vars if name not in found]])
     return add_group(idata, "log_likelihood", found, {}, extend_inferencedata)
+
+
+def _warn_of_sequence(names: Sequence[str]) -> None:
+    if names:
+        warnings.warn(
+            f"the terms of {', '.join(map(repr, names))} are conditional on the earlier "
+            "observations: az.loo and az.compare of them are no leave-one-out cross-validation. "
+            "Compare scores psf.leave_future_out(idata, model, min_observations=..., refit=lambda "
+            "model: psf.sample_dram(model=model))",
+            EvidenceWarning,
+            stacklevel=3,
+        )
 
 
 def sequential_terms(

@@ -166,6 +166,7 @@ class EnKF(EnsembleFilterBase):
 
     def check(self, system: System) -> None:
         """Raise if observations cannot be simulated, or a memory would be moved like a number."""
+        super().check(system)
         check_simulated_observations(type(self).__name__, system)
         if system.carried and not system.model.has_gaussian_steps:
             raise ModelError(

@@ -39,7 +39,7 @@ from .point_mass.moments import FILTERED, MOMENTS
 from .point_mass.predictions import GRID_PREDICTIONS
 from .point_mass.segment_pass import discard_segments, pass_on_segments
 from .point_mass.states import GRID_RUN, GRID_STATES
-from .protocol import System
+from .protocol import System, check_sensor_has_noise
 from .signatures import LIKELIHOOD_OF_NOISE, PREDICTIONS, RUN, STATES
 
 # Beside a kink the error falls with the square of the spacing: 8192 points reach about 1e-6.
@@ -125,6 +125,7 @@ class GridFilter:
                 "GridFilter integrates over Gaussian noise and a Gaussian start, got other "
                 "distributions in process_dist or initial_dist, or steps of Milstein"
             )
+        check_sensor_has_noise(type(self).__name__, system)
         if system.m == 0:
             raise ModelError(
                 "GridFilter needs process noise, which makes the density smooth, and this system "

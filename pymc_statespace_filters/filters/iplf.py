@@ -28,7 +28,7 @@ from ..system.model import StateSpaceModel
 from .gaussian.base import GaussianFilterBase
 from .gaussian.linearization import GaussianState, Seen, Symbols, seen
 from .gaussian.sigma_points import SigmaPoints, at_points
-from .protocol import System
+from .protocol import System, check_sensor_has_noise
 
 _MOST_ITERATIONS = 1000
 
@@ -82,6 +82,7 @@ class IPLF(GaussianFilterBase):
     def check(self, system: System) -> None:
         """Raise if the moments of the observation are unknown or a state is carried."""
         self._check_not_carried(system)
+        check_sensor_has_noise(type(self).__name__, system)
         if system.gaussian_observation:
             return
         if system.model.equations.observation_draw is None:

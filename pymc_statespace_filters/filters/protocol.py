@@ -180,3 +180,13 @@ def check_filter(filter: Any) -> None:
         raise ModelError(
             f"filter must be a filter such as psf.EKF() or psf.EnKF(1250), got {filter!r}"
         )
+
+
+def check_sensor_has_noise(name: str, system: System) -> None:
+    """Raise if a sensor has no noise, where the filter ``name`` needs its density."""
+    if system.has_exact_sensor:
+        raise ModelError(
+            f"{name} needs the density of an observation given the state, which a "
+            "sensor without noise has not: observation_noise must be positive definite, got a "
+            "variance of zero"
+        )

@@ -5,6 +5,7 @@ from .evidence import plot_evidence, plot_model_probabilities
 from .filter_health import plot_filter_health
 from .forecast import plot_forecast
 from .phase import plot_phase
+from .predictive import plot_predictive
 from .prior_sensitivity import plot_prior_sensitivity
 from .residuals import plot_residuals
 from .states import plot_states
@@ -16,6 +17,7 @@ __all__ = [
     "plot_forecast",
     "plot_model_probabilities",
     "plot_phase",
+    "plot_predictive",
     "plot_prior_sensitivity",
     "plot_residuals",
     "plot_states",

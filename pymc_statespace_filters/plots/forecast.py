@@ -121,7 +121,7 @@ def plot_forecast(
     if n_past is not None:
         check_count("n_past", n_past, 0)
     group, results = group_of(idata, *((group,) if group else GROUPS))
-    name = variable_of(_predicted(results), var_name)
+    name = variable_of(predicted(results), var_name)
     facets = several_records(idata, group, name, name, records)
     idata, truth = facets.idata, facets.truth(truth, "observations")
     results, transform = idata[group].to_dataset(), facets.mapping(transform)
@@ -164,7 +164,7 @@ def plot_forecast(
     return collection
 
 
-def _predicted(results: xr.Dataset) -> xr.Dataset:
+def predicted(results: xr.Dataset) -> xr.Dataset:
     """Return the predicted observations of each variable: (chain, draw, time, observable)."""
     names = [str(name) for name in results if results[name].ndim == len(SAMPLE_DIMS) + 2]
     return results[[name for name in names if not name.endswith(("_states", "_rmse_of_draws"))]]

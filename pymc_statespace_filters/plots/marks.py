@@ -191,11 +191,6 @@ def functions_of(transform: Any, names: Sequence[str], others: Sequence[str] = (
     )
 
 
-def of_record(transform: Any, functions: Functions) -> Functions:
-    """Return the functions of observations beside states: those that a mapping names."""
-    return {} if callable(transform) else functions
-
-
 def transformed(array: xr.DataArray, along: str, functions: Functions) -> xr.DataArray:
     """Apply to each entry along the dimension `along` its function, if it has one."""
     names = [str(name) for name in array[along].values]

@@ -1,6 +1,6 @@
 """Records of a panel as plots take them: each as results of a variable without a panel."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,6 +30,32 @@ def one_record(idata: xr.DataTree, group: str, name: str, record: Any) -> xr.Dat
     if "sample_stats" in idata.children:
         found["sample_stats"] = idata["sample_stats"].to_dataset()
     return xr.DataTree.from_dict(found)
+
+
+def with_rows_of_panel(idata: xr.DataTree, group: str, name: str) -> xr.DataTree:
+    """Give a group of PyMC's the record and the time of each row, which constant data have.
+
+    A variable without a panel is left as it is.
+    """
+    if "constant_data" not in idata.children or f"{name}_panel" in idata[group].coords:
+        return idata
+    known = idata["constant_data"].to_dataset()
+    if f"{name}_panel" not in known:
+        return idata
+    results = idata[group].to_dataset()
+    coords = _coords_of_rows(known, name, _labels_of_records(idata, name), results[name].dims[-2])
+    return xr.DataTree.from_dict(
+        {child: node.to_dataset() for child, node in idata.children.items()}
+        | {group: results.assign_coords(coords)}
+    )
+
+
+def _labels_of_records(idata: xr.DataTree, name: str) -> list[Any] | None:
+    """The labels of the records, if a variable of any group is along them."""
+    for node in idata.children.values():
+        if (labels := node.coords.get(f"{name}_record")) is not None:
+            return list(labels.values.tolist())
+    return None
 
 
 class Facets(NamedTuple):
@@ -167,14 +193,18 @@ def _data_of(idata: xr.DataTree, name: str, labels: Sequence[Any]) -> xr.Dataset
     data, known = idata["observed_data"].to_dataset(), idata["constant_data"].to_dataset()
     if not {f"{name}_panel", f"{name}_time"} <= set(known) or name not in data:
         return None
-    row = data[name].dims[0]
+    return data[[name]].assign_coords(_coords_of_rows(known, name, labels, data[name].dims[0]))
+
+
+def _coords_of_rows(
+    known: xr.Dataset, name: str, labels: Sequence[Any] | None, row: Hashable
+) -> dict[str, Any]:
+    """Record and time of each row, along the dimension ``row``, from constant data."""
     of_rows = known[f"{name}_panel"].values
-    if isinstance(labels[0], str):  # their data are numbers of records
+    if labels and isinstance(labels[0], str):  # their data are numbers of records
         of_rows = np.array(labels)[of_rows]
     times = known[f"{name}_time"]
-    return data[[name]].assign_coords(
-        {f"{name}_panel": (row, of_rows), f"{name}_time": (row, times.values, times.attrs)}
-    )
+    return {f"{name}_panel": (row, of_rows), f"{name}_time": (row, times.values, times.attrs)}
 
 
 def _side_by_side(parts: Sequence[xr.DataArray], labels: Sequence[Any]) -> xr.DataArray:

@@ -23,7 +23,6 @@ from .marks import (
     draw_data,
     draw_median,
     functions_of,
-    of_record,
     over_draws,
     paths,
     points,
@@ -95,10 +94,10 @@ def plot_states(
         Number of draws to show beside the bands: as lines for smoothed states at every step, as
         points for filtered states and for states at observation times only.
     transform : callable or mapping of str to callable, optional
-        Function of an array that is applied to the states and the truth before they are drawn:
-        ``numpy.exp`` shows the abundance if the state is its logarithm. The observations are drawn
-        as they are. A mapping from names of states gives each its function, and may name
-        observables too, whose observations are then transformed.
+        Function of an array that is applied to the states, the truth, and the observables with
+        names of states before they are drawn: ``numpy.exp`` shows the abundance if the state is its
+        logarithm. Observables with other names are drawn as they are. A mapping from names of
+        states and observables gives each its function.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
         Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
@@ -160,7 +159,7 @@ def plot_states(
         collection.map(mark, "draws", data=thin_draws(data, n_draws), **style)
     legend = {}
     if record is not None and set(shown) & set(measured):
-        record = transformed(record, "observable", of_record(transform, functions))
+        record = transformed(record, "observable", functions)
         legend = draw_data(collection, observations_of(record, measured, shown))
     lines = {} if as_bars else draw_median(collection, quantiles)
     if true is not None:
@@ -233,7 +232,7 @@ def draw_simulation(
 
     functions = functions_of(transform, all_states, seen)
     path = transformed(path, "state", functions)
-    record = transformed(record, "observable", of_record(transform, functions))
+    record = transformed(record, "observable", functions)
     data = path.reindex(state=panels).to_dataset(name="path")
     collection = canvas_over_time(
         data, "state", facets.panels_in_line, backend=backend, pc_kwargs=pc_kwargs

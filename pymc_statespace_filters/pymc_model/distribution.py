@@ -51,13 +51,14 @@ class StateSpace(Continuous):
         scalars, which all G records share, or have a leading dimension G, in the order of the
         records' rows (a declared parameter's own shape comes last). See `panel_from`.
     observed : array_like, shape (J, p) or (J,), optional
-        The data. NaN marks a missing component and is never imputed; a wholly missing row has the
+        The data; columns of a DataFrame or DataArray are aligned with the system's observables by
+        name. NaN marks a missing component and is never imputed; a wholly missing row has the
         term 0. To replace the data later, give `steps`, `observed` and `inputs` as ``pm.Data``,
         with ``dims=("{name}_time", "observable")``; ``pm.Data`` refuses NaN, ``pytensor.shared``
         accepts it.
     inputs : array_like, shape (rows, n_inputs), optional
-        Row k holds during step k. The records of a panel share them, or have one such array each:
-        a mapping from labels, or a list in the order of the records.
+        Row k holds during step k; named columns are aligned. The records of a panel share them, or
+        have one such array each: a mapping from labels, or a list in the order of the records.
     t0 : float
         Time of step 0.
     seed : int

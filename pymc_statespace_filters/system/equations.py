@@ -221,9 +221,9 @@ def static_shape(symbol: TensorVariable) -> tuple[int | None, ...]:
     return tuple(None if isinstance(s, Variable) else int(s) for s in lengths)
 
 
-def read_covariance(role: str, value: Any) -> Any:
-    """A covariance as an `Equation` of parameters alone, or as the numbers given."""
-    return read_equation(role, value, "") if callable(value) else value
+def read_covariance(role: str, value: Any, symbols: Sequence[str] = "") -> Any:
+    """A covariance as an `Equation` of parameters and these symbols, or as the numbers given."""
+    return read_equation(role, value, symbols) if callable(value) else value
 
 
 def trace_covariance(
@@ -231,15 +231,13 @@ def trace_covariance(
     covariance: Any,
     size: int | None,
     values: Mapping[str, Variable],
-    *,
-    definite: bool = False,
 ) -> TensorVariable:
     """The matrix (size, size) of a covariance; numbers are checked."""
     if isinstance(covariance, Equation):
         matrix = as_matrix(role, covariance(values), size, size)
         _check_symmetry(role, matrix)
         return matrix
-    return pt.as_tensor(_constant_covariance(role, covariance, size, definite=definite))
+    return pt.as_tensor(_constant_covariance(role, covariance, size))
 
 
 def _check_symmetry(role: str, matrix: TensorVariable) -> None:
@@ -271,7 +269,7 @@ def _check_symmetry(role: str, matrix: TensorVariable) -> None:
         )
 
 
-def _constant_covariance(role: str, value: Any, size: int | None, *, definite: bool) -> np.ndarray:
+def _constant_covariance(role: str, value: Any, size: int | None) -> np.ndarray:
     try:
         matrix = np.array(value, dtype="float64")
     except (TypeError, ValueError):
@@ -292,10 +290,5 @@ def _constant_covariance(role: str, value: Any, size: int | None, *, definite: b
         raise ModelError(
             f"{role} must be a covariance (not a standard deviation) without negative eigenvalues, "
             f"got {matrix.tolist()} with the eigenvalue {smallest:.6g}"
-        )
-    if definite and smallest <= 0:
-        raise ModelError(
-            f"{role} must be positive definite (every observable needs noise), got "
-            f"{matrix.tolist()} with the smallest eigenvalue {smallest:.6g}"
         )
     return matrix

@@ -40,7 +40,9 @@ class StateSpaceModel:
         With an argument ``e``, noise of covariance (r, r) enters in any form; densities then use
         ``D Gamma D^T`` at ``e = 0`` (Eq. 4.4), an approximation.
     observation_noise, process_noise : array_like or callable
-        Covariances (not standard deviations), or functions of parameters only that return them.
+        Covariances (not standard deviations), or functions of parameters that return them; that of
+        the observation may have the arguments ``u`` and ``t``, for a known error bar of each
+        observation. With a variance of zero a sensor is exact, which only `EKF` and `UKF` take.
     process_dist : callable, optional
         ``f(x, u, t, ...)`` returning a list of PyMC distributions in place of ``process_noise``:
         the components of ``q``, drawn at every step given the present state. Vectors such as

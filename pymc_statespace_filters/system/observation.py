@@ -87,7 +87,7 @@ class GaussianObservation:
                 "observation_noise must be the covariance of the observation, got None"
             )
         self.observation = _of_state(read_equation("observation", observation, "xeut"))
-        self.covariance = read_covariance("observation_noise", covariance)
+        self.covariance = read_covariance("observation_noise", covariance, "ut")
 
     @property
     def equations(self) -> tuple[Equation, ...]:
@@ -102,7 +102,7 @@ class GaussianObservation:
         if additive:
             seen = as_vector("observation", self.observation(values), n_observables)
             p = r = seen.type.shape[0]
-        cov = trace_covariance("observation_noise", self.covariance, r, values, definite=additive)
+        cov = trace_covariance("observation_noise", self.covariance, r, values)
         noise = pt.tensor("e", shape=(cov.type.shape[0],), dtype="float64")
         if additive:
             seen = seen + noise

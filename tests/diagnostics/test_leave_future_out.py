@@ -153,6 +153,7 @@ def test_missing_scores_are_not_compared(exact, idata):
     assert np.isnan(pickle.loads(pickle.dumps(found)).elpd)
 
 
+@pytest.mark.filterwarnings("ignore:the terms of")
 def test_stored_terms_are_used_if_they_are_sequential_and_ours(exact, idata):
     idata = idata.copy()
     psf.compute_log_likelihood(idata, exact)

@@ -8,11 +8,14 @@ import xarray as xr
 from scipy.stats import halfnorm
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from tests.diagnostics.records import SYSTEM
 from tests.systems import PAIR, PAIR_DATA, STEPS, pair_terms
 
-pytestmark = pytest.mark.usefixtures("interpreted")
+pytestmark = [
+    pytest.mark.usefixtures("interpreted"),
+    pytest.mark.filterwarnings("ignore:the terms of"),
+]
 
 RECORD = np.array([0.3, -0.2, np.nan, 0.9, 1.4])
 AT = [0, 2, 3, 4, 7]
@@ -190,3 +193,12 @@ def test_a_record_without_parameters_has_the_same_terms_at_every_draw():
     idata = az.from_dict({"posterior": {"c": np.zeros((1, 3))}})
     found = psf.compute_log_likelihood(idata, model)["log_likelihood"]["d"]
     np.testing.assert_allclose(found, np.tile(pair_terms(0.5, 0.1), (1, 3, 1)), rtol=1e-9)
+
+
+def test_it_is_said_that_terms_are_not_those_of_leave_one_out():
+    with pm.Model() as model:
+        pm.Normal("a")
+        psf.StateSpace("d", PAIR, psf.EKF(), steps=STEPS, observed=PAIR_DATA)
+    idata = az.from_dict({"posterior": {"a": np.full((1, 2), 0.5)}})
+    with pytest.warns(EvidenceWarning, match=r"terms of 'd' .* no leave-one-out .*refit="):
+        psf.compute_log_likelihood(idata, model, progressbar=False)

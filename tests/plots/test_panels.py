@@ -8,6 +8,7 @@ from pymc_statespace_filters import (
     plot_filter_health,
     plot_forecast,
     plot_phase,
+    plot_predictive,
     plot_residuals,
     plot_states,
 )
@@ -40,6 +41,20 @@ def a_tree(group, variable, values, dims, last, names=("level",), **attrs):
 def states():
     dims = ("chain", "draw", "d_obs", "state")
     return a_tree("smoothed_states", "d_states", DRAWN[..., None], dims, "state", at="observations")
+
+
+@pytest.fixture
+def forecast_of_past():
+    times = np.arange(8.0)
+    coords = {"d_time": times, "observable": ["level"]}
+    drawn = {"d": (("chain", "draw", "d_time", "observable"), DRAWN[..., None])}
+    data = {"d": (("d_time", "observable"), DATA[:, None])}
+    return xr.DataTree.from_dict(
+        {
+            "posterior_predictive": xr.Dataset(drawn, coords),
+            "observed_data": xr.Dataset(data, coords),
+        }
+    )
 
 
 def drawn_points(collection, visual, **where):
@@ -193,3 +208,30 @@ def test_what_is_refused(states):
         plot_states(alone, records=["A"], backend="none")
     with pytest.raises(ModelError, match="record must be None, because 'd' is no panel"):
         plot_phase(alone, "level", "level", record="A", backend="none")
+
+
+@pytest.mark.parametrize("labels", [LABELS, None])
+def test_replicated_observations_of_each_record(labels):
+    """Draws of PyMC have no record and time of a row; texts are known where results have them."""
+    dims = ("chain", "draw", "d_obs", "sensor")
+    tree = a_tree("posterior_predictive", "d", DRAWN[..., None], dims, "sensor")
+    tree["posterior_predictive"] = tree["posterior_predictive"].to_dataset().drop_vars(ROWS)
+    if labels is not None:
+        tree["posterior"] = xr.Dataset({"rate": ("d_record", [1.0, 2.0])}, {"d_record": labels})
+    collection = plot_predictive(tree, backend="matplotlib")
+    for number, label in enumerate(LABELS if labels else [0, 1]):
+        rows = OF_ROWS == LABELS[number]
+        where = {"observable": f"{label}: level"}
+        points = drawn_points(collection, "data", **where)
+        np.testing.assert_array_equal(points, np.stack([TIMES[rows], DATA[rows]], axis=1))
+        median = collection.get_viz("median", **where).get_ydata()
+        expected = np.median(DRAWN[..., rows], axis=(0, 1))
+        np.testing.assert_allclose(median[np.isin(np.unique(TIMES), TIMES[rows])], expected)
+
+
+def test_replicated_observations_of_one_record(forecast_of_past):
+    collection = plot_predictive(forecast_of_past, backend="none")
+    assert {"band_90", "band_50", "median", "data"} <= set(collection.viz.children)
+    assert "end" not in collection.viz.children
+    with pytest.raises(ModelError, match="idata has no group 'prior_predictive'"):
+        plot_predictive(forecast_of_past, group="prior_predictive")

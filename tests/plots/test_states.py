@@ -198,7 +198,7 @@ def test_years_at_the_time_axis_are_whole_numbers():
 @pytest.mark.parametrize(
     ("transform", "data"),
     [
-        (np.exp, SINE[::5]),
+        (np.exp, np.exp(SINE[::5])),  # the observable has the name of a state
         ({"speed": np.exp}, SINE[::5]),
         ({"speed": np.exp, "position": np.exp}, np.exp(SINE[::5])),
     ],
@@ -270,6 +270,8 @@ def test_a_simulation_with_chosen_states_and_observables(simulated):
     assert list(drawn(collection, "path")) == ["position", "speed"]
     np.testing.assert_array_equal(drawn(collection, "data")["speed"]["y"], np.arange(9))
     np.testing.assert_allclose(drawn(collection, "path")["position"]["y"], SINE**2)
+    data = drawn(collection, "data")["position"]["y"]
+    np.testing.assert_allclose(data, (SINE[::5] + 0.1) ** 2)
     one = plot_states(simulated, states="speed", backend="none")
     assert list(drawn(one, "path")) == ["speed"]
     assert "data" not in one.viz.children

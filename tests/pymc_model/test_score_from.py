@@ -90,6 +90,7 @@ def draws(values):
     )
 
 
+@pytest.mark.filterwarnings("ignore:the terms of")
 def test_pointwise_terms_draws_and_diagnostics():
     model, idata = model_of(1), draws([A, 0.2])
     terms = psf.compute_log_likelihood(idata, model, progressbar=False)["log_likelihood"]["d"]

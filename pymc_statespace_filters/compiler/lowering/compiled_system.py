@@ -4,6 +4,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 import pytensor.tensor as pt
+from pytensor.tensor.linalg import cholesky
 from pytensor.tensor.variable import TensorVariable
 
 from ...system.model import StateSpaceModel
@@ -16,7 +17,7 @@ from .guidance import guided_noise, linearize_step, n_gains, observation_informa
 from .guide_loops import follow, look_back
 from .jumps import jumping_equations
 from .observation import expected_observation, observation_log_density
-from .symbols import call, symbols_of
+from .symbols import call, symbols_of, uses
 
 quantiles.register()
 
@@ -187,7 +188,7 @@ class CompiledSystem:
     def observe(self) -> MemberFunction:
         """Simulate an observation of every member."""
         z = _normals(self.r)
-        noise = {"e": self._coloured("observation_noise", z)}
+        noise = {"e": self._sensor_noise(z)}
         seen = call(self.model.equations.observation, self.model, self._given("xut") | noise)
         arguments = "c, inputs, k, t, Z, X, D"
         return self._member_function("observe", arguments, seen, "out", "xut", z=z)
@@ -227,6 +228,13 @@ class CompiledSystem:
     def _coloured(self, name: str, z: TensorVariable) -> TensorVariable:
         """Noise of this covariance; an integrator's noise is white."""
         return self._square_roots[name] @ z if name in self._square_roots else z
+
+    def _sensor_noise(self, z: TensorVariable) -> TensorVariable:
+        """Noise of an observation, whose covariance may depend on inputs and time."""
+        covariance = self.model.equations.observation_noise
+        if covariance is None or not uses(covariance, "ut"):
+            return self._coloured("observation_noise", z)
+        return cholesky(call(covariance, self.model, self._given("ut")), lower=True) @ z
 
     def _member_function(
         self, name: str, arguments: str, output: TensorVariable, target: str, inputs: str = "", **z
@@ -285,6 +293,11 @@ class CompiledSystem:
     def has_smooth_sensor(self) -> bool:
         """Whether no observable has a kink as a function of the state."""
         return structure.has_smooth_sensor(self.model)
+
+    @cached_property
+    def has_exact_sensor(self) -> bool:
+        """Whether a sensor has no noise; False if unknown."""
+        return structure.has_exact_sensor(self.model)
 
     @cached_property
     def is_time_invariant(self) -> bool:

@@ -29,7 +29,7 @@ from ..codegen.function_types import ParameterFunction
 from ..native.entry_point import F64_PTR, EntryPoint
 from ..numerics.small_cholesky import covariance_root
 from .staged import ENTRY_POINTS, staged
-from .symbols import call
+from .symbols import call, uses
 
 # Functions that are called at every step; the others, once per evaluation.
 _AT_EVERY_STEP = (
@@ -150,8 +150,14 @@ def _symbols(extension: FrozenFunctionGraph) -> tuple[TensorVariable, TensorVari
 def covariances(
     system: StateSpaceModel, merged_noise: FrozenFunctionGraph | None = None
 ) -> dict[str, FrozenFunctionGraph]:
-    """Covariances whose square roots colour the noise; an integrator's noise is white."""
+    """Covariances of parameters, whose square roots colour the noise.
+
+    An integrator's noise is white. The covariance of an observation that depends on inputs or time
+    is none of them.
+    """
     graphs = dict(vars(system.equations))
+    if graphs["observation_noise"] is not None and uses(graphs["observation_noise"], "ut"):
+        graphs["observation_noise"] = None
     if not system.has_gaussian_start:
         graphs["initial_cov"] = None
     if merged_noise is not None:

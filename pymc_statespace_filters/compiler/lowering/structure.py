@@ -8,7 +8,7 @@ import pytensor
 import pytensor.scalar as ps
 import pytensor.tensor as pt
 from pymc.pytensorf import constant_fold
-from pytensor.graph.basic import Variable
+from pytensor.graph.basic import Constant, Variable
 from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.variable import TensorVariable
 
@@ -18,7 +18,15 @@ from ..codegen.expressions import in_order, is_constant
 from ..codegen.function_types import Graph
 from ..codegen.functions import unrolled
 from ..codegen.scalarize import NotUnrollableError
-from .symbols import SYMBOLS, call, jacobian_of, process_noise_cov, symbols_of, transition_moments
+from .symbols import (
+    SYMBOLS,
+    call,
+    jacobian_of,
+    observation_moments,
+    process_noise_cov,
+    symbols_of,
+    transition_moments,
+)
 
 _N_TRIALS = 5
 _KINKED = (
@@ -206,6 +214,18 @@ def step_moments(system: StateSpaceModel, symbols: Mapping[str, TensorVariable])
     """(g(x, 0), G Q G^T) of a system of one state with additive noise."""
     mean, cov = transition_moments(system, symbols)
     return pt.specify_shape(pt.concatenate([mean, cov.ravel()]), (2,))
+
+
+def has_exact_sensor(system: StateSpaceModel) -> bool:
+    """Whether a sensor is known to have no noise: its density given the state does not exist."""
+    if not system.gaussian_observation:
+        return False
+    symbols = symbols_of(system)
+    _, cov = observation_moments(system, symbols)
+    if not isinstance(cov, Constant):
+        return any(_zeros(pt.diagonal(cov), symbols))
+    eigenvalues = np.linalg.eigvalsh(cov.data)
+    return bool(eigenvalues.min() <= 1e-12 * eigenvalues.max())
 
 
 def process_noise_reaches_every_state(system: StateSpaceModel) -> bool:

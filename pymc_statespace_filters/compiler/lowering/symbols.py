@@ -1,6 +1,6 @@
 """The traced functions of a system at given symbols, and their Jacobians."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import pytensor.tensor as pt
 from pytensor.gradient import jacobian
@@ -38,6 +38,13 @@ def call(
     ]
     (output,) = graph.bind(arguments)
     return output
+
+
+def uses(graph: FrozenFunctionGraph, names: Sequence[str]) -> bool:
+    """Whether a traced function depends on one of these symbols."""
+    symbols = [graph.inputs[SYMBOLS.index(name)] for name in names]
+    found = [*graph.outputs, *(v for node in graph.apply_nodes for v in node.inputs)]
+    return any(symbol in found for symbol in symbols)
 
 
 def process_noise_cov(

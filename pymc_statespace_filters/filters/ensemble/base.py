@@ -16,7 +16,7 @@ from ...compiler.numerics.normals import BLOCK, padded
 from ...errors import ModelError
 from ...system.checks import is_integer
 from ..plan import make_plan
-from ..protocol import System
+from ..protocol import System, check_sensor_has_noise
 from ..signatures import LIKELIHOOD_OF_NOISE, NORMALS, RUN, STATES, TERM_HEALTH
 from .noise import STORE_NORMALS, NoiseSizes, n_stored
 from .summaries import LAST_EVENTS, MEMBER_RUN, MEMBER_STATES, STORE_MEMBERS, SUMMARISE
@@ -103,7 +103,8 @@ class EnsembleFilterBase:
         return self
 
     def check(self, system: System) -> None:
-        """Raise if the filter cannot treat the system."""
+        """Raise if the filter cannot treat the system, here as a sensor has no noise."""
+        check_sensor_has_noise(type(self).__name__, system)
 
     def is_exact_for(self, system: System) -> bool:
         """Whether the expected likelihood is that of the system, for any number of members."""

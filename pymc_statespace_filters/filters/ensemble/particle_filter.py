@@ -84,6 +84,7 @@ class ParticleFilter(EnsembleFilterBase):
 
     def check(self, system: System) -> None:
         """Raise if the scheme has to sort particles and cannot sort those of so many states."""
+        super().check(system)
         check_sortable(self.resampling, system.n)
 
     def plan(

@@ -14,7 +14,7 @@ from ...compiler.native.plan import Plan
 from ...compiler.native.planned_function import PlannedFunction
 from ...errors import ModelError
 from ...system.model import StateSpaceModel
-from ..protocol import System
+from ..protocol import System, check_sensor_has_noise
 from ..signatures import GRADIENT, LIKELIHOOD_OF_NOISE, PULLBACK, RUN, STATES, TAPED
 from .backward import BACKWARD
 from .forward import FORWARD
@@ -106,7 +106,9 @@ class GaussianFilterBase:
         return linearizations_of(system.model.gaussian, self.linearization)
 
     def _check_gaussian(self, system: System) -> None:
-        """Raise if the observation of an uncertain state is not Gaussian."""
+        """Raise if the observation of an uncertain state is not Gaussian, that of another exact."""
+        if system.is_deterministic:
+            check_sensor_has_noise(type(self).__name__, system)
         if not (system.gaussian_observation or system.is_deterministic):
             raise ModelError(
                 f"{type(self).__name__} needs an observation function with Gaussian noise, got "

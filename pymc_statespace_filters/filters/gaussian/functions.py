@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytensor
 import pytensor.tensor as pt
-from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
@@ -28,7 +27,7 @@ from ...compiler.codegen.scalarize import NotUnrollableError
 from ...compiler.codegen.simd import LaneFunction, Places, lane_functions
 from ...compiler.codegen.steps import step_functions
 from ...compiler.lowering.constants import covariances
-from ...compiler.lowering.symbols import call
+from ...compiler.lowering.symbols import call, uses
 from ...compiler.native.entry_point import EntryPoint
 from ...compiler.native.plan import Plan
 from ...system.model import StateSpaceModel
@@ -170,7 +169,7 @@ def covariances_at(
     found = {
         name: graph
         for name, graph in covariances(system).items()
-        if name in others or depends_on_theta(graph)
+        if name in others or uses(graph, ["theta"])
     }
     covs = [call(graph, system, {"theta": theta}) for graph in found.values()]
     sizes = [cov.type.shape[0] for cov in covs]
@@ -180,18 +179,13 @@ def covariances_at(
     return Covariances(values, dict(zip(found, zip(firsts, sizes, strict=False), strict=True)))
 
 
-def depends_on_theta(graph: FrozenFunctionGraph) -> bool:
-    """Whether a covariance has to be checked at every theta."""
-    return any(graph.inputs[0] in node.inputs for node in graph.apply_nodes)
-
-
 def checked(system: StateSpaceModel, covs: Covariances, n_theta: int) -> tuple[int, ...]:
     """The settings of a plan: row in ``W``, size and failure of each covariance to check."""
     graphs = covariances(system)
     return tuple(
         number
         for name, (first, size) in covs.places.items()
-        if depends_on_theta(graphs[name])
+        if uses(graphs[name], ["theta"])
         for number in (n_theta + first, size, Failure[name.upper()])
     )
 
