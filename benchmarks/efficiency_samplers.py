@@ -11,7 +11,7 @@ import pymc as pm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.native.rows import Rows
-from pymc_statespace_filters.sampling.run import model_task
+from pymc_statespace_filters.sampling.run import model_task, population_search
 from pymc_statespace_filters.sampling.target.settings import RandomWalkSettings
 from pymc_statespace_filters.sampling.target.target import Target
 
@@ -50,22 +50,25 @@ class Clock:
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        """Count in this block; earlier versions have neither a search nor a common warm-up."""
+        """Count in this block; earlier versions do not use the gradient."""
         task = model_task.ModelTask
-        prepare, extend, call = task.prepare, getattr(task, "extend", None), Rows.__call__
-        search = getattr(model_task, "find_population", None)
+        prepare, extend, call = task.prepare, task.extend, Rows.__call__
+        search, gradient = population_search.find_population, getattr(Target, "gradient_rows", None)
 
-        def prepared(this):
+        def compiled(function, *args, **kwargs):
             began = time.process_time()
-            target = prepare(this)
+            result = function(*args, **kwargs)
             self.compilation += time.process_time() - began
-            return target
+            return result
+
+        def with_gradient(this, **kwargs):
+            return compiled(gradient, this, **kwargs)
 
         def found(*args, **kwargs):
-            began = time.process_time()
+            began, before = time.process_time(), self.compilation
             with patch.object(Rows, "__call__", rows):
                 population = search(*args, **kwargs)
-            self.starts += time.process_time() - began
+            self.starts += time.process_time() - began - (self.compilation - before)
             return population
 
         def rows(mapped, *columns):
@@ -79,9 +82,10 @@ class Clock:
             return goes_on
 
         with (
-            patch.object(task, "prepare", prepared),
-            patch.object(task, "extend", extended, create=True),
-            patch.object(model_task, "find_population", found, create=True),
+            patch.object(task, "prepare", lambda this: compiled(prepare, this)),
+            patch.object(Target, "gradient_rows", with_gradient, create=True),
+            patch.object(task, "extend", extended),
+            patch.object(population_search, "find_population", found),
         ):
             yield
 

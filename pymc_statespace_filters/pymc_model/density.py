@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
+import pytensor
 from numpy.typing import NDArray
 from pymc.pytensorf import compile as compile_pymc
 from pymc.pytensorf import join_nonshared_inputs
@@ -42,15 +43,21 @@ def compile_raveled(
     variables: Sequence[TensorVariable],
     seeds: Mapping[str, TensorVariable] | None = None,
     further: Sequence[Variable] = (),
+    *,
+    with_gradient: bool = False,
     **options: Any,
 ) -> tuple[Any, NDArray[np.float64]]:
     """Compile graphs over the vector of all variables: the function, and the vector at a point.
+
+    With the gradient, that of the first graph by the vector is a further result.
 
     The other arguments of the function are a seed for each shared one, which ``seeds`` has by the
     name of its StateSpace variable, and ``further``.
     """
     inputs = {seed: seed.type(f"{name}_seed_input") for name, seed in (seeds or {}).items()}
     graphs, joined = join_nonshared_inputs(point, outputs, variables, inputs)
+    if with_gradient:
+        graphs = [*graphs, pytensor.grad(graphs[0], joined)]
     arguments = [joined, *inputs.values(), *further]
     function = compile_density(arguments, graphs, **({"on_unused_input": "ignore"} | options))
     function.trust_input = True

@@ -51,8 +51,12 @@ def path_table(path, proposals):
     return log_q
 
 
-def transition_matrix(pi, proposals, accept):
-    """P[y, z] by walking every path; what no stage accepts stays at y."""
+def transition_matrix(pi, proposals, accept, believed=None):
+    """P[y, z] by walking every path; what no stage accepts stays at y.
+
+    ``believed`` are the proposals of the acceptance probability, if they are others.
+    """
+    believed = believed or proposals
     with np.errstate(divide="ignore"):
         log_pi = np.log(pi)
     matrix = np.zeros((N_STATES, N_STATES))
@@ -69,7 +73,7 @@ def transition_matrix(pi, proposals, accept):
             reached = probability * proposals[stage - 1][longer]
             if reached == 0.0:
                 continue
-            alpha = np.exp(accept(log_pi[list(longer)], path_table(longer, proposals), stage))
+            alpha = np.exp(accept(log_pi[list(longer)], path_table(longer, believed), stage))
             assert 0.0 <= alpha <= 1.0
             matrix[path[0], z] += reached * alpha
             walk(longer, reached * (1.0 - alpha))
@@ -153,6 +157,16 @@ def same_rejection_twice(log_pi, log_q, stage):
 def test_the_check_finds_wrong_formulas(wrong):
     matrix = transition_matrix(FULL, random_proposals(2, seed=2), wrong)
     assert imbalance(FULL, matrix) > 1e-4
+
+
+def test_one_size_for_all_stages_is_balanced_and_one_for_each_is_not():
+    """A kernel for each of two sizes, chosen before the first stage; or anew before the second."""
+    small, large = (random_proposals(2, seed=seed) for seed in (2, 3))
+    matrices = [transition_matrix(FULL, size, log_acceptance) for size in (small, large)]
+    assert imbalance(FULL, 0.1 * matrices[0] + 0.9 * matrices[1]) < 1e-14
+
+    mixed = [small[0], 0.1 * small[1] + 0.9 * large[1]]
+    assert imbalance(FULL, transition_matrix(FULL, mixed, log_acceptance, small)) > 1e-4
 
 
 def test_zero_probabilities_give_no_nan():

@@ -200,7 +200,7 @@ def test_each_model_stops_on_its_own(model, stopped):
     assert_identical(trees["one"], stopped)
     alone = sample_dram(models["other"], **RULE)
     assert_identical(trees["other"], alone)
-    assert alone["posterior"].sizes["draw"] < stopped["posterior"].sizes["draw"]
+    assert alone["posterior"].sizes["draw"] != stopped["posterior"].sizes["draw"]
 
 
 def test_a_limit_is_said_with_what_was_reached(model, caplog):

@@ -17,7 +17,7 @@ Differences from the sources
       half to three quarters of the warm-up, so that a bad start is forgotten and yet a covariance
       is not estimated from one block alone, which is poor once d is more than a few.
     * A covariance from few accepted moves is averaged with the covariance in use before, which
-      counts as d/5 moves. So a direction not explored yet keeps a proposal of sensible size.
+      counts as d^2 moves. So a direction not explored yet keeps a proposal of sensible size.
     * The scale is reduced in steps: to a fifth after a block that accepts almost nothing, to a half
       if the first stage accepts less than 5 %; it is 1 again once more than 10 % is accepted.
       Between the two lies the acceptance at which pseudo-marginal chains work best.
@@ -61,8 +61,8 @@ LOW_ACCEPTANCE, FAIR_ACCEPTANCE = 0.05, 0.10
 STALLED, SHRINK = 0.2, 0.5
 # Stalls in a row that reduce the scale; the next one resets the adaptation.
 MOST_STALLS = 6
-# Weight of the covariance in use before, in accepted moves for each dimension.
-PRIOR_MOVES = 0.2
+# Weight of the covariance in use before, in accepted moves for each of its elements.
+PRIOR_MOVES = 1.0
 # The multiple of the identity, relative to the mean variance.
 JITTER = 1e-8
 
@@ -93,8 +93,8 @@ def learn(
     stage : int
         The stage whose proposal was accepted, 0 if none was.
     is_free : bool
-        Whether the proposal was not the random walk's. Its draw counts for the covariance, but not
-        for the acceptance rate.
+        Whether the proposal was not a random walk of the adapted size. Its draw counts for the
+        covariance, but not for the acceptance rate.
     """
     block = state.block.counts
     _include(state.block, 1.0, position)
@@ -224,7 +224,7 @@ def _learn_covariance(state: AdaptationState) -> None:
         _merge(moments, state.block)
     n, moved, base = moments.counts[N], moments.counts[MOVED], state.base
     dim = base.shape[0]
-    weight = moved / (moved + PRIOR_MOVES * dim)
+    weight = moved / (moved + PRIOR_MOVES * dim**2)
     factor = weight * (2.38 * state.numbers[SCALE]) ** 2 / (dim * n)
     cov, mean_variance = np.empty((dim, dim)), 0.0
     for i in range(dim):

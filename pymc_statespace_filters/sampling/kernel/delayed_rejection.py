@@ -17,6 +17,10 @@ as the stage ``|e - s|`` from z_s over the points between them, and ``log_accept
 table of log alpha from the short parts to the long ones. Nothing is assumed of the proposals: they
 may be non-symmetric and depend on the whole path.
 
+A tenth of the walks are of a smaller size, drawn for all stages together. A mixture of reversible
+kernels is reversible. Such walks enter necks and leave corners where the adapted size is too large,
+and where a chain would otherwise stand for hundreds of iterations.
+
 The functions are compiled and pure: PyMC's step method and whole compiled chains call the same
 code.
 
@@ -30,6 +34,9 @@ P. J. Green and A. Mira (2001). Delayed rejection in reversible jump Metropolis-
 import numpy as np
 
 from ...compiler.native.jit import linked
+
+SMALL_SHARE = 0.1  # of the walks
+SMALLEST = 0.01  # size of a walk, relative to the adapted one
 
 
 @linked()
@@ -150,3 +157,17 @@ def _log_one_minus_exp(log_p: float) -> float:
     if log_p > -0.6931471805599453:
         return np.log(-np.expm1(log_p))
     return np.log1p(-np.exp(log_p))
+
+
+@linked()
+def walk_size(uniform: float) -> float:
+    """The size of a walk relative to the adapted one: 1, or log-uniform between `SMALLEST` and 1.
+
+    Examples
+    --------
+    >>> walk_size.py_func(0.5)
+    1.0
+    >>> walk_size.py_func(0.05)
+    0.1
+    """
+    return 1.0 if uniform >= SMALL_SHARE else SMALLEST ** (1.0 - uniform / SMALL_SHARE)

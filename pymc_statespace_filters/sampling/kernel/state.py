@@ -81,7 +81,8 @@ class RandomBlock(NamedTuple):
     normals: np.ndarray  # (iterations, stages, d), for the proposals
     log_uniforms: np.ndarray  # (iterations, stages + 1), to accept a stage or a screened move
     seeds: np.ndarray  # int64 (iterations, stages, noisy), of the estimated likelihoods
-    # (iterations, 2), uniform: to choose the kind of proposal, and a component of the mixture
+    # (iterations, 2), uniform: to choose the kind of proposal, and a component of the mixture or
+    # the size of a walk
     choices: np.ndarray
     spreads: np.ndarray  # (iterations,), of a Student-t distribution relative to a normal one
 

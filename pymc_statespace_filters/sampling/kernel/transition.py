@@ -26,7 +26,7 @@ from ...compiler.native.pytensor_function import make_call
 from ...filters.outcomes import NOT_A_NUMBER, RAISED
 from .adaptation import learn
 from .adaptation_state import unpack
-from .delayed_rejection import gaussian_log_acceptance
+from .delayed_rejection import gaussian_log_acceptance, walk_size
 from .independence import (
     SHARE,
     ProposalMixture,
@@ -143,7 +143,7 @@ def evaluate(density):
 
 
 @_internal
-def _delayed_rejection(density, log_density, position, chol, settings, random, k):
+def _delayed_rejection(density, log_density, position, chol, size, settings, random, k):
     """Propose stage by stage until a proposal is accepted (thesis, Eqs. 3.30-3.32)."""
     dim = position.size
     log_pi = np.empty(settings.n_stages + 1)
@@ -157,7 +157,7 @@ def _delayed_rejection(density, log_density, position, chol, settings, random, k
         for i in range(dim):
             moved = position[i]
             for j in range(i + 1):
-                moved += chol[i, j] * offsets[stage, j]
+                moved += size * chol[i, j] * offsets[stage, j]
             density.position[i] = moved
         copy_into(density.seeds, random.seeds[k, stage - 1])
         value = evaluate(density)
@@ -199,7 +199,10 @@ def _propose(density, log_density, state, settings, laws, random, k, is_free):
     """Make the proposals of an iteration on a density."""
     if is_free:
         return _independence(density, log_density, state.position, laws.mixture, random, k)
-    return _delayed_rejection(density, log_density, state.position, laws.chol, settings, random, k)
+    size = walk_size(random.choices[k, 1])
+    return _delayed_rejection(
+        density, log_density, state.position, laws.chol, size, settings, random, k
+    )
 
 
 @_internal
@@ -297,13 +300,15 @@ def advance(settings, target, screen, state, random, first, draws, row, n, contr
             for i in range(state.position.size):
                 copy_into(draws.covs[at, i], adapted.cov[i])
         if settings.adapts:
+            # A small walk is accepted whatever the covariance, and says nothing about it.
+            is_small = not is_free and walk_size(random.choices[k, 1]) < 1.0
             learn(
                 settings.adapt_every,
                 settings.continuous,
                 adapted,
                 state.position,
-                counts[STAGE],
-                is_free,
+                0 if is_small else counts[STAGE],
+                is_free or is_small,
             )
             scaling = _scaling(adapted.chol)
         done += 1

@@ -169,12 +169,11 @@ def n_search_points(request: SamplingRequest, target: Target) -> int:
 def searched_cov(
     request: SamplingRequest, target: Target, population: np.ndarray | None
 ) -> np.ndarray | None:
-    """The first proposal covariance after a short search; None if it is the user's or the prior's.
+    """The first proposal covariance after a search; None if it is the user's or the prior's.
 
-    A mixture fitted to few points may suit none, and the prior may be a thousand times too wide.
+    The prior may be a thousand times too wide.
     """
-    is_complete = n_search_points(request, target) == N_POINTS
-    if population is None or request.proposal_cov is not None or is_complete:
+    if population is None or request.proposal_cov is not None:
         return None
     points = standardised(population)
     if points is None:

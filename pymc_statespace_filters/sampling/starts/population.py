@@ -6,6 +6,9 @@ square root of its likelihood, and from there to the posterior, which takes fewe
 square root, because the two likelihoods may differ by many nats. Draws of some variables from a
 pilot, if there are any, lead the way instead (`nested_reference`).
 
+In many dimensions the moves of the annealing are too few. The population then settles by moves
+along the gradient, if there is one (`langevin`).
+
 The cost is proportional to the number of points. If they are few, the `EKF` still leads many, which
 cost little, and an expensive filter evaluates some of them.
 """
@@ -27,13 +30,17 @@ from ..target.initial_points import N_DRAWS
 from ..target.settings import RandomWalkSettings
 from ..target.target import Target
 from ..target.variables import RaveledVariables
-from .annealing import Population, anneal
+from .annealing import N_SWEEPS, Population, anneal
+from .langevin import settle
 from .modes import Points, find_modes
 
 N_POINTS = 256
 _TYPICAL_EVALUATIONS = 36  # for each point, for the progress bar
 _DRAWN = 4  # draws of a reference for each point, at most N_POINTS or what the EKF has found
 _DEPTH, _DEPTH_PER_DIMENSION = 10.0, 3.0  # nats below the highest point, where points are left out
+_MANY_DIMENSIONS = 9  # in which moves along the gradient are worth its compilation
+_PER_DIMENSION = 3  # points, for the metric of these moves
+_TYPICAL_MOVES = 40  # of each point, for the progress bar
 _MOST_BATCHES = 10  # of draws of the prior
 _FEWEST = 16  # points of positive likelihood, for a pilot to lead the way
 
@@ -105,9 +112,10 @@ def find_population(
             found = _annealed(drawn, n_points, rng, fewest=1)
         if found is None:
             raise ModelError(_nowhere(target, rows, drawn[0].x, rng))
-        log_density = found.log_first + found.log_ratio
-        modes = find_modes(found.x, lambda x: full(x)[1], rng)
-    return Points(found.x, log_density, modes)
+        x, log_density = found.x, found.log_first + found.log_ratio
+    if settled := _settled(target, x, rng, of_pilot=False, progressbar=progressbar):
+        x, log_density = settled
+    return Points(x, log_density, find_modes(x, lambda x: full(x)[1], rng))
 
 
 def _led_by_ekf(
@@ -126,7 +134,34 @@ def _led_by_ekf(
         cheap = _densities(rows, target, rng)
         drawn = _prior_population(target, _from_prior(cheap), N_POINTS)
         found = _annealed(drawn, N_POINTS, rng)
-    return None if found is None else (found.x, cheap)
+    if found is None:
+        return None
+    settled = _settled(target, found.x, rng, of_pilot=True, progressbar=progressbar)
+    return (found.x if settled is None else settled[0]), cheap
+
+
+def _settled(
+    target: Target, x: Array, rng: np.random.Generator, *, of_pilot: bool, progressbar: bool
+) -> tuple[Array, Array] | None:
+    """Points of the last sweep moved along the gradient, and their log-densities.
+
+    None in few dimensions, where the annealing is enough, or if there is no gradient.
+    """
+    dim = target.raveled.dim
+    last = x[-(len(x) // N_SWEEPS) :]
+    if dim < _MANY_DIMENSIONS or len(last) < _PER_DIMENSION * dim:
+        return None
+    rows = target.gradient_rows(of_pilot=of_pilot)
+    if rows is None:
+        return None
+
+    def evaluate(x: Array) -> tuple[Array, Array]:
+        results = rows(x, *_seeds(target, len(x), rng).T)
+        return _number(results[0]), results[-1]
+
+    with row_progress(rows, enabled=progressbar) as announce:
+        announce("Settling the starts", _TYPICAL_MOVES * len(last))
+        return settle(last, evaluate, rng)
 
 
 def _nowhere(target: Target, rows: Rows, x: Array, rng: np.random.Generator) -> str:

@@ -62,6 +62,13 @@ class LogDensity:
     group : Communicator, optional
         Ranks that evaluate the noisy likelihoods together. The first, this one, evaluates the
         log-density; the others call `leader_follower.follow`.
+    with_gradient : bool
+        Whether the last result of `at_rows` is the gradient.
+
+    Raises
+    ------
+    GradientUnavailableError
+        If the gradient is asked for and a filter has none.
     """
 
     def __init__(
@@ -76,6 +83,7 @@ class LogDensity:
         correlation: float | None = None,
         graph: TensorVariable | None = None,
         group: Communicator | None = None,
+        with_gradient: bool = False,
     ):
         others = [v for v in model.value_vars if v not in variables]
         self.others = tuple(v.name for v in others)
@@ -105,7 +113,13 @@ class LogDensity:
         self._n_noises = len(noise)
         further = [*others, *noise_inputs]
         self._function, self._start = compile_raveled(
-            point, outputs, variables, seeds, further, **(compile_kwargs or {})
+            point,
+            outputs,
+            variables,
+            seeds,
+            further,
+            with_gradient=with_gradient,
+            **(compile_kwargs or {}),
         )
         self._n_seeds = len(seeds)
         self._others = [np.array(point[name]) for name in self.others]

@@ -10,9 +10,11 @@ from functools import cached_property
 
 import numpy as np
 from pymc.model import Model
+from pytensor.gradient import NullTypeGradError
 from pytensor.tensor.variable import TensorVariable
 
-from ...errors import ModelError
+from ...compiler.native.rows import Rows
+from ...errors import GradientUnavailableError, ModelError
 from ...parallel.communicator import Communicator
 from ...parallel.signals import held_interrupts
 from ...pymc_model.graph_rewrites import expensive_variables, pilot_filters
@@ -98,6 +100,23 @@ class Target(SampledModel):
             return None
         graph = tempered_density(self._model, filters, PILOT_POWER)
         return LogDensity(*self._shared, fixed_noise=True, graph=graph)
+
+    def gradient_rows(self, *, of_pilot: bool) -> Rows | None:
+        """The log-density, or that of the pilot, with its gradient as the last result.
+
+        None if a likelihood is noisy, or has no gradient.
+        """
+        graph = None
+        if of_pilot:
+            graph = tempered_density(self._model, pilot_filters(self._model), PILOT_POWER)
+        elif self.is_expensive:
+            return None
+        try:
+            return LogDensity(
+                *self._shared, fixed_noise=of_pilot, graph=graph, with_gradient=True
+            ).at_rows()
+        except (GradientUnavailableError, NotImplementedError, NullTypeGradError):
+            return None
 
     @property
     def carries_noise(self) -> bool:

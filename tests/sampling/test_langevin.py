@@ -1,0 +1,98 @@
+"""Langevin moves of a population: metric and points are exact for a normal density."""
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+import pytest
+from pytensor import wrap_py
+from scipy.stats import chi2, kstest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.sampling.starts.langevin import metric_factor, settle
+from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target.target import Target
+from tests.systems import FREE
+
+DIM = 20
+
+
+def normal(seed=1, dim=DIM):
+    """Mean, covariance, and log-density with gradient of a correlated normal distribution."""
+    rng = np.random.default_rng(seed)
+    chol = np.tril(rng.standard_normal((dim, dim))) + 3.0 * np.eye(dim)
+    chol *= np.exp(rng.uniform(-5, 5, dim))[:, None]
+    mean, cov = rng.standard_normal(dim), chol @ chol.T
+    precision = np.linalg.inv(cov)
+
+    def evaluate(x):
+        gradient = -(x - mean) @ precision
+        return 0.5 * (gradient * (x - mean)).sum(axis=1), gradient
+
+    return mean, cov, evaluate
+
+
+def far_and_narrow(mean, cov, n=128):
+    """Points a hundred standard deviations from the mean, of another shape."""
+    sd = np.sqrt(np.diag(cov))
+    return mean + sd * (100.0 + 0.1 * np.random.default_rng(2).standard_normal((n, len(mean))))
+
+
+def test_metric_of_a_normal_density_is_its_covariance_wherever_the_points_are():
+    mean, cov, evaluate = normal()
+    x = far_and_narrow(mean, cov)
+    chol = metric_factor(x, evaluate(x)[1])
+    np.testing.assert_allclose(chol @ chol.T, cov, rtol=1e-4, atol=1e-6 * np.abs(cov).max())
+
+
+def test_metric_without_a_gradient_along_a_direction_is_bounded():
+    x = np.random.default_rng(3).standard_normal((50, 2))
+    chol = metric_factor(x, np.column_stack([-x[:, 0], np.zeros(50)]))
+    assert np.isfinite(chol).all()
+    assert metric_factor(np.zeros((50, 2)), x) is None
+
+
+def test_settled_points_have_the_distribution():
+    """Squared distances of the last round are chi-squared: Kolmogorov-Smirnov at 0.1 %."""
+    mean, cov, evaluate = normal()
+    x, log_density = settle(far_and_narrow(mean, cov), evaluate, np.random.default_rng(4))
+    assert x.shape == (3 * 128, DIM)
+    np.testing.assert_allclose(log_density, evaluate(x)[0])
+    assert kstest(-2.0 * log_density[-128:], chi2(DIM).cdf).pvalue > 0.001
+
+
+def test_points_of_no_density_stay_out():
+    """Half a normal distribution, with nothing on the other side."""
+
+    def evaluate(x):
+        inside = x[:, 0] > 0.0
+        return np.where(inside, -0.5 * (x**2).sum(axis=1), -np.inf), -x
+
+    x, _ = settle(
+        1.0 + np.random.default_rng(5).random((64, 2)), evaluate, np.random.default_rng(6)
+    )
+    assert (x[:, 0] > 0.0).all()
+
+
+def test_the_gradient_is_that_of_the_log_density():
+    """Of the EKF that leads a noisy filter, which has no gradient itself."""
+    with pm.Model() as model:
+        params, filter = {"a": pm.Normal("a")}, psf.BootstrapPF(10)
+        psf.StateSpace("d", FREE, filter, params=params, steps=[0, 1, 2], observed=[0.1, -0.4, 0.9])
+    target = Target(model, None, DRAMSettings())
+    assert target.gradient_rows(of_pilot=False) is None
+    x, seeds = np.array([[0.3], [0.3 + 1e-6], [0.3 - 1e-6]]), np.zeros((1, 3), dtype=np.int64)
+    values = target.pilot_density().at_rows()(x, *seeds)[0]
+    results = target.gradient_rows(of_pilot=True)(x, *seeds)
+    np.testing.assert_allclose(results[0], values, rtol=1e-10)
+    assert results[-1][0, 0] == pytest.approx((values[1] - values[2]) / 2e-6, rel=1e-5)
+
+
+@pytest.mark.filterwarnings("ignore:Numba will use object mode:UserWarning")
+def test_a_model_without_a_gradient_has_none():
+    @wrap_py(itypes=[pt.dscalar], otypes=[pt.dscalar])
+    def opaque(x):
+        return np.asarray(-(x**2))
+
+    with pm.Model() as model:
+        pm.Potential("p", opaque(pm.Normal("x")))
+    assert Target(model, None, DRAMSettings()).gradient_rows(of_pilot=False) is None
