@@ -8,7 +8,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError, ModelWarning
 from pymc_statespace_filters.pymc_model.unused_priors import warn_of_unused_priors
 from pymc_statespace_filters.sampling.target.sampled_model import SampledModel
-from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target.settings import RandomWalkSettings
 from tests.systems import PAIR, PAIR_DATA, STEPS, pair_terms
 
 pytestmark = pytest.mark.usefixtures("interpreted")
@@ -27,7 +27,7 @@ def test_a_misspelt_prior_is_named_with_the_default_that_is_used_instead():
     model = model_with(lambda: pm.Normal("beta"))
     said = r"prior of 'beta' reaches no likelihood.*parameter 'b' of 'd' is fixed.*'b': beta"
     with pytest.warns(ModelWarning, match=said):
-        SampledModel(model, None, DRAMSettings())
+        SampledModel(model, None, RandomWalkSettings())
     with model, pytest.warns(ModelWarning, match=said):  # as a sampler of PyMC asks
         found = model.logp(vars=[model["d"]])
     at = {model.rvs_to_values[model["a"]]: 0.5}

@@ -192,7 +192,7 @@ def test_a_chain_leaves_a_corner_that_is_smaller_than_its_walk(stages):
     """
     with pm.Model() as model:
         pm.Normal("x", 0.0, 1.0)
-    target = Target(model, None, DRAMSettings(stages=stages, stage_scale=0.5), [[50.0**2]])
+    target = Target(model, None, RandomWalkSettings(stages=stages, stage_scale=0.5), [[50.0**2]])
     target.prepare()
     n = 60_000
     task = ChainTask(

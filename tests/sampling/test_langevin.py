@@ -9,7 +9,7 @@ from scipy.stats import chi2, kstest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.sampling.starts.langevin import metric_factor, settle
-from pymc_statespace_filters.sampling.target.settings import DRAMSettings
+from pymc_statespace_filters.sampling.target.settings import RandomWalkSettings
 from pymc_statespace_filters.sampling.target.target import Target
 from tests.systems import FREE
 
@@ -78,7 +78,7 @@ def test_the_gradient_is_that_of_the_log_density():
     with pm.Model() as model:
         params, filter = {"a": pm.Normal("a")}, psf.BootstrapPF(10)
         psf.StateSpace("d", FREE, filter, params=params, steps=[0, 1, 2], observed=[0.1, -0.4, 0.9])
-    target = Target(model, None, DRAMSettings())
+    target = Target(model, None, RandomWalkSettings())
     assert target.gradient_rows(of_pilot=False) is None
     x, seeds = np.array([[0.3], [0.3 + 1e-6], [0.3 - 1e-6]]), np.zeros((1, 3), dtype=np.int64)
     values = target.pilot_density().at_rows()(x, *seeds)[0]
@@ -95,4 +95,4 @@ def test_a_model_without_a_gradient_has_none():
 
     with pm.Model() as model:
         pm.Potential("p", opaque(pm.Normal("x")))
-    assert Target(model, None, DRAMSettings()).gradient_rows(of_pilot=False) is None
+    assert Target(model, None, RandomWalkSettings()).gradient_rows(of_pilot=False) is None
