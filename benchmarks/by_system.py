@@ -87,8 +87,8 @@ def measure(case: Case, filter, exact: float) -> Cell:
     run = evaluator(LogLikelihood(case.system, filter))
     given = flat_parameters(case.system, case.given)
     record = checked_record(
-        case.system, case.observed, steps=case.steps, times=None, inputs=case.inputs, t0=0.0
-    )
+        case.system, case.observed, steps=case.steps, inputs=case.inputs
+    ).arguments
     totals = []
     run(given, *record, np.asarray(N_SEEDS))  # compiles
     start = time.process_time()

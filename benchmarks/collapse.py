@@ -32,8 +32,8 @@ def errors_and_warnings(case: Case, filter, exact: float) -> tuple[np.ndarray, n
     run = evaluator(LogLikelihood(case.system, filter))
     given = flat_parameters(case.system, case.given)
     record = checked_record(
-        case.system, case.observed, steps=case.steps, times=None, inputs=case.inputs, t0=0.0
-    )
+        case.system, case.observed, steps=case.steps, inputs=case.inputs
+    ).arguments
     found = [run(given, *record, np.asarray(seed))[:2] for seed in range(N_SEEDS)]
     error = np.array([terms.sum() for terms, _ in found]) - exact
     return error, np.array([health[0] < COLLAPSED for _, health in found])

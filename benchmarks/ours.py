@@ -13,6 +13,7 @@ from benchmarks.systems import STEPS, SYSTEMS, simulated, theta_of
 from benchmarks.timing import Timed
 from pymc_statespace_filters.ops.likelihood import LogLikelihood, LogLikelihoodOfNoise, StoredNoise
 from pymc_statespace_filters.system.record import check_inputs
+from pymc_statespace_filters.system.time_axis import TimeAxis
 
 
 class Likelihood:
@@ -24,7 +25,8 @@ class Likelihood:
         if observed is None:
             self.inputs, self.observed = simulated(system, truth, self.steps)
         else:
-            self.inputs, self.observed = check_inputs(None, system, self.steps), observed
+            axis = TimeAxis(self.steps, 0.0, system.dt)
+            self.inputs, self.observed = check_inputs(None, system, axis), observed
 
     def total(self, theta, noise=0, operation=LogLikelihood):
         record = [pytensor.shared(a) for a in (self.steps, self.observed, self.inputs)]

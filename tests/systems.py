@@ -214,6 +214,5 @@ def counts(*, a=0.8, bend=0.0, level=0.0, noise_var=0.2, initial_mean=0.0, initi
 def log_likelihoods(system, filter, params, seeds, **record):
     """Total log-likelihoods (n_seeds,) of a filter with noise, without a warning."""
     run = evaluator(LogLikelihood(system, filter))
-    settings = {"times": None, "inputs": None, "t0": 0.0} | record
-    arguments = (flat_parameters(system, params), *checked_record(system, **settings))
+    arguments = (flat_parameters(system, params), *checked_record(system, **record).arguments)
     return np.array([run(*arguments, seed)[0].sum() for seed in seeds])

@@ -15,11 +15,11 @@ from ..filters.protocol import HealthFilter
 from ..pymc_model.inspection import given_model
 from ..pymc_model.state_graphs import StateSpaceVariable
 from ..states.draws import select_draws
-from ..states.groups import add_group, by_record, join_rows, row_coords
+from ..states.groups import add_group, by_record, coords_of_steps, join_rows
 from ..states.record import Array, RecordAtDraws, States, TermHealthAtDraws, simulate_observations
 from ..states.variable import VariableAtDraws, select_variables
-from ..system.accumulators import inputs_of_user
 from ..system.checks import check_random_seed
+from ..system.input_columns import inputs_of_user
 from .calibration import (
     autocorrelation_of,
     coverage_of,
@@ -185,7 +185,9 @@ class _Found(NamedTuple):
 def _of_record(record: RecordAtDraws, rng: np.random.Generator) -> _Found:
     before = record.states("predicted", record.steps, rng)
     health = _term_health(record, before, rng)
-    predicted = simulate_observations(record, before.drawn, record.steps, record.inputs, rng)
+    predicted = simulate_observations(
+        record, record.variable.system, before.drawn, record.steps, record.inputs, rng
+    )
     laws = laws_of(record, before)
     if laws is None:
         calibration = calibration_by_rank(predicted, record.scored, rng)
@@ -221,7 +223,7 @@ def _results_by_draw(at_draws: VariableAtDraws, found: list[_Found]) -> xr.Datas
             ),
         },
         {
-            **row_coords(at_draws, [one.record.steps for one in found]),
+            **coords_of_steps(at_draws, [one.record.steps for one in found]),
             observable: list(variable.system.observables),
         },
     )

@@ -11,7 +11,7 @@ from ..errors import EvidenceWarning, ModelError
 from ..pymc_model.inspection import given_model
 from ..pymc_model.state_graphs import StateSpaceVariable, terms_of
 from ..states.draws import PosteriorDraws, select_draws
-from ..states.groups import add_group, row_coords
+from ..states.groups import add_group, coords_of_steps
 from ..states.record import Array, Graphs
 from ..states.variable import VariableAtDraws, select_variables
 
@@ -148,7 +148,7 @@ def sequential_terms(
     at_draws = VariableAtDraws(model, variable, draws)
     name, (record,) = variable.name, at_draws.records
     (terms,) = _terms(at_draws, progressbar)
-    coords = row_coords(at_draws, [record.steps])
+    coords = coords_of_steps(at_draws, [record.steps])
     found = draws.dataset({name: (variable.dims[:1], terms)}, coords)[name]
     return found.assign_attrs(terms=SEQUENTIAL)
 

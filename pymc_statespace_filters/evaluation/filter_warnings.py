@@ -21,6 +21,7 @@ from ..filters.recommendation import (
 from ..ops.base import evaluator
 from ..ops.likelihood import LogLikelihood
 from ..ops.states import TermHealth
+from ..system.input_columns import times_of_steps
 from ..system.model import StateSpaceModel
 from ..system.parameters import element_names
 
@@ -90,10 +91,10 @@ def _place(
     system: StateSpaceModel, failure: Failure, row: float, arguments: Arguments, of_many: bool
 ) -> str:
     """Where an evaluation failed, the first of many: its row and time, and its parameters."""
-    theta, steps, _, _, t0, *_ = arguments
+    theta, steps, _, inputs, t0, *_ = arguments
     first, parts = ", first" if of_many else "", []
     if failure.has_row:
-        time = t0 + steps[int(row)] * system.dt
+        time = times_of_steps(system, inputs, steps[int(row)], t0)
         parts.append(f" in row {int(row)}, at time {time:.6g}")
     if of_many and 0 < theta.size <= _MOST_LISTED:
         named = zip(element_names(system), theta, strict=True)

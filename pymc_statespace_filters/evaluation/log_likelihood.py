@@ -35,7 +35,10 @@ def log_likelihood(
     times: Any = None,
     panel: Any = None,
     inputs: Any = None,
-    t0: float = 0.0,
+    t0: Any = 0.0,
+    unit: Any = None,
+    input_times: Any = None,
+    inputs_at: str = "hold",
     seed: Any = 0,
     comm: Any = None,
     cores: int = 1,
@@ -54,14 +57,14 @@ def log_likelihood(
     steps : array_like of int, shape (J,)
         The step of each observation; 0 is where the initial state holds. Or give `times`.
     times : array_like, shape (J,)
-        Times of the observations, on the grid ``t0 + k * dt`` to a millionth of a step.
+        Times of the observations, numbers or dates, see `StateSpace`.
     panel : array_like of int or str, shape (J,), optional
         For many records: the label of the record of each row, see `StateSpace`. Parameters are
         then numbers for all G records, or have a leading dimension G; ``seed`` is one number.
     inputs : array_like, shape (rows, n_inputs)
         Row k holds during step k; in a panel, one such array for all records or one for each.
-    t0 : float
-        Time of step 0.
+    t0, unit, input_times, inputs_at
+        See `StateSpace`.
     seed : int or array_like of int
         Seed of the noise inside the filter, if it has any; broadcasts with the parameters.
     comm : mpi4py.MPI.Intracomm or "world", optional
@@ -107,12 +110,16 @@ def log_likelihood(
     """
     check_system_and_filter(system, filter)
     warn_of_choice(system, filter)
+    data = {
+        "steps": steps, "times": times, "inputs": inputs, "t0": t0, "unit": unit,
+        "input_times": input_times, "inputs_at": inputs_at,
+    }  # fmt: skip
     if panel is not None:
-        data = {"steps": steps, "times": times, "inputs": inputs, "t0": t0}
         return _of_panel(system, filter, params, panel, observed, data, seed, comm, cores)
     if check_count("cores", cores, 1) > 1:
         raise ModelError(f"cores must be 1 without a panel, whose records it divides, got {cores}")
-    record = checked_record(system, observed, steps=steps, times=times, inputs=inputs, t0=t0)
+    placed = checked_record(system, observed, **data)
+    system, record = placed.system, placed.arguments
     theta = flat_parameters(system, params)
     seeds = check_seed("seed", seed)
     try:
@@ -132,7 +139,7 @@ def log_likelihood(
         if ranks.rank == 0:
             flat = seeds.ravel()
             warn_about(system, filter, health, lambda i: (points[i], *record, flat[i]))
-    return terms.reshape(*shape, record.steps.size)
+    return terms.reshape(*shape, record[0].size)
 
 
 def _of_panel(
@@ -150,6 +157,7 @@ def _of_panel(
     if comm is not None:
         raise ModelError("comm must be None for a panel: every rank evaluates all records")
     table = checked_panel(system, panel, observed, **data)
+    system = table.system
     theta = panel_parameters(system, params, table.records)
     seeds = check_seed("seed", seed)
     if seeds.ndim:

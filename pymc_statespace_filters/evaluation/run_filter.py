@@ -4,7 +4,6 @@ A run that goes on with more rows begins with what an earlier one has stored.
 """
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,10 +15,12 @@ from ..filters.protocol import Filter, properties
 from ..filters.recommendation import check_system_and_filter
 from ..ops.base import evaluator
 from ..ops.states import FilterRun, ResumableRun
+from ..system.clock import Clock
 from ..system.model import StateSpaceModel
-from ..system.panel import checked_panel, row_coords
+from ..system.panel import CheckedPanel, checked_panel
 from ..system.parameters import flat_parameters, panel_parameters
-from ..system.record import check_seed, checked_record
+from ..system.placement import Earlier
+from ..system.record import CheckedRecord, check_seed, checked_record
 from ..system.steps import check_at, rows_at
 from .filter_warnings import warn_about, warn_of_choice
 
@@ -36,7 +37,10 @@ def run_filter(
     times: Any = None,
     panel: Any = None,
     inputs: Any = None,
-    t0: float = 0.0,
+    t0: Any = 0.0,
+    unit: Any = None,
+    input_times: Any = None,
+    inputs_at: str = "hold",
     seed: int = 0,
     at: str = "observations",
     state: xr.Dataset | None = None,
@@ -49,7 +53,7 @@ def run_filter(
     filter : EKF, UKF, IPLF, EnKF, BootstrapPF, GuidedPF, PFEnKF or GridFilter
     params : mapping
         A value for every parameter; in a panel of G records, one for all or one for each.
-    observed, steps, times, panel, inputs, t0
+    observed, steps, times, panel, inputs, t0, unit, input_times, inputs_at
         The record, or the records of a panel, as in `log_likelihood`.
     seed : int
         Seed of the noise inside the filter, if it has any. The run is that of `log_likelihood` with
@@ -120,16 +124,22 @@ def run_filter(
     noise = check_seed("seed", seed)
     if noise.ndim:
         raise ModelError(f"run_filter takes one seed, got an array of {noise.shape}")
-    data = {"steps": steps, "times": times, "inputs": inputs, "t0": t0}
+    data = {
+        "steps": steps, "times": times, "inputs": inputs, "t0": t0, "unit": unit,
+        "input_times": input_times, "inputs_at": inputs_at,
+    }  # fmt: skip
+    if state is not None:
+        system, data["earlier"] = _earlier(system, state)
     labels = None
+    table: CheckedRecord | CheckedPanel
     if panel is None:
-        record = checked_record(system, observed, **data)
+        table = checked_record(system, observed, **data)
         theta = flat_parameters(system, params)
         if theta.ndim != 1:
             raise ModelError(
                 f"run_filter takes one value per parameter, got arrays of {theta.shape[:-1]}"
             )
-        arguments: list[Any] = [(theta, *record, noise)]
+        arguments: list[Any] = [(theta, *table.arguments, noise)]
     else:
         table = checked_panel(system, panel, observed, **data)
         labels = table.records.labels
@@ -137,7 +147,11 @@ def run_filter(
         seeds = seeds_of_records(noise, table.records.codes)
         of_each = zip(of_records, table.single_records(), seeds, strict=True)
         arguments = [(own, *record, own_seed) for own, record, own_seed in of_each]
+    system = table.system
     common = attributes(system, filter, [each[0] for each in arguments], noise, arguments[0][4])
+    axes = [table.axis] if isinstance(table, CheckedRecord) else table.axes
+    ends = [float(axis.times(axis.steps[-1])) for axis in axes]
+    clock = {"unit": table.clock.unit or 0, "origins": list(table.clock.origins), "ends": ends}
     first = [np.int64(0)] * len(arguments)
     before = [np.empty(0)] * len(arguments)
     if state is not None:
@@ -163,15 +177,28 @@ def run_filter(
     dataset = dataset.assign(log_likelihood=(term_dim, np.concatenate(terms)))
     if left:
         dataset = dataset.assign(stored(left, labels))
-    begin = float(arguments[0][4])
-    if labels is None:
-        coords: dict[str, Any] = {
-            dim: begin + own[0] * system.dt for dim, own in ((row_dim, rows), (term_dim, at_steps))
-        }
+    coords: dict[str, Any]
+    if isinstance(table, CheckedRecord):
+        coords = {row_dim: table.times(rows[0]), term_dim: table.times(at_steps[0])}
     else:
-        coords_of = partial(row_coords, t0=begin, dt=system.dt)
-        coords = coords_of(row_dim, labels, rows) | coords_of(term_dim, labels, at_steps, "obs_")
-    return dataset.assign_coords(coords).assign_attrs(common, at=at)
+        coords = table.coords(row_dim, rows) | table.coords(term_dim, at_steps, "obs_")
+    return dataset.assign_coords(coords).assign_attrs(common, at=at, **clock)
+
+
+def _earlier(system: StateSpaceModel, state: Any) -> tuple[StateSpaceModel, Earlier | None]:
+    """The system of an earlier run, on a grid or not, and where its records go on."""
+    if not isinstance(state, xr.Dataset) or STATE not in state:
+        return system, None  # refused later, with the reason
+    attrs = {"unit": 0, "origins": [], "ends": [], "t0": 0.0} | state.attrs
+    clock = Clock(int(attrs["unit"]) or None, tuple(map(int, np.atleast_1d(attrs["origins"]))))
+    steps = [int(one[0]) if np.isfinite(one[0]) else 0 for one in np.atleast_2d(state[STATE])]
+    ends = list(map(float, np.atleast_1d(attrs["ends"])))
+    is_same = attrs["system"] == system.fingerprint
+    if not is_same and system.why_one_length is None:
+        any_times = system.at_any_times
+        if attrs["system"] == any_times.fingerprint:
+            return any_times, Earlier(clock, float(attrs["t0"]), steps, ends)
+    return system, Earlier(clock, float(attrs["t0"]), steps, None)
 
 
 def _dataset(

@@ -1,7 +1,7 @@
 """Forward simulation of a system, in machine code."""
 
 from collections.abc import Callable, Mapping
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,12 +19,11 @@ from ..compiler.numerics.philox import generators_of_records
 from ..errors import ModelError
 from ..parallel.signals import held_interrupts
 from ..progress import slow_compilation
-from ..system.checks import check_finite, check_flag, check_random_seed
+from ..system.checks import check_flag, check_random_seed
 from ..system.model import StateSpaceModel
-from ..system.panel import checked_panel, row_coords
+from ..system.panel import checked_panel
 from ..system.parameters import flat_parameters, panel_parameters
-from ..system.record import check_inputs, check_system
-from ..system.steps import steps_of
+from ..system.record import check_system, checked_record
 
 _MANY_STEPS = 100_000  # some milliseconds at the least
 
@@ -231,7 +230,10 @@ def simulate(
     times: Any = None,
     panel: Any = None,
     inputs: Any = None,
-    t0: float = 0.0,
+    t0: Any = 0.0,
+    unit: Any = None,
+    input_times: Any = None,
+    inputs_at: str = "hold",
     noise: bool = True,
     random_seed: Any = None,
 ) -> xr.Dataset:
@@ -249,8 +251,8 @@ def simulate(
         are then numbers for all G records, or have a leading dimension G.
     inputs : array_like, shape (rows, n_inputs)
         Row k holds during step k; in a panel, one such array for all records or one for each.
-    t0 : float
-        Time of step 0.
+    t0, unit, input_times, inputs_at
+        See `StateSpace`.
     noise : bool
         Whether to draw the initial state, process noise and measurement noise. If not, the path
         starts at the initial mean, and ``q`` and ``e`` are zero. What is drawn from
@@ -295,12 +297,14 @@ def simulate(
     {'row': 72, 'state': 1, 'obs': 5, 'observable': 1}
     """
     check_system(system)
+    data = {
+        "steps": steps, "times": times, "inputs": inputs, "t0": t0, "unit": unit,
+        "input_times": input_times, "inputs_at": inputs_at,
+    }  # fmt: skip
     if panel is not None:
-        data = {"steps": steps, "times": times, "inputs": inputs, "t0": t0}
         return _simulate_panel(system, params, panel, data, noise, random_seed)
-    t0 = check_finite("t0", t0)
-    at = steps_of(steps, times, system.dt, t0)
-    forces = check_inputs(inputs, system, at)
+    record = checked_record(system, None, **data)
+    system, (at, _, forces, _) = record.system, record.arguments
     theta = flat_parameters(system, params)
     if theta.ndim != 1:
         raise ModelError(
@@ -308,7 +312,8 @@ def simulate(
         )
     with_noise = check_flag("noise", noise)
     rng = check_random_seed(random_seed)
-    states, observations = _run(simulator(system, with_noise).function, rng, theta, at, forces, t0)
+    run = simulator(system, with_noise).function
+    states, observations = _run(run, rng, theta, at, forces, record.axis.t0)
     n_steps = np.arange(states.shape[0])
     return xr.Dataset(
         {
@@ -320,8 +325,8 @@ def simulate(
             "state": list(system.states),
             "obs": at,
             "observable": list(system.observables),
-            "time": ("step", t0 + n_steps * system.dt),
-            "obs_time": ("obs", t0 + at * system.dt),
+            "time": ("step", record.times(n_steps)),
+            "obs_time": ("obs", record.times(at)),
         },
     )
 
@@ -341,8 +346,8 @@ def _simulate_panel(
     random_seed: Any,
 ) -> xr.Dataset:
     """Simulate every record with a generator of its own."""
-    unseen = np.full((np.size(panel), system.p), np.nan)
-    table = checked_panel(system, panel, unseen, **data)
+    table = checked_panel(system, panel, None, **data)
+    system = table.system
     theta = panel_parameters(system, params, table.records)
     run = simulator(system, check_flag("noise", noise)).function
     generators = generators_of_records(check_random_seed(random_seed), table.records.codes)
@@ -353,8 +358,6 @@ def _simulate_panel(
     ]
     states, observations = (np.concatenate(parts) for parts in zip(*simulated, strict=True))
     n_steps = [np.arange(len(path)) for path, _ in simulated]
-    coords_of = partial(row_coords, t0=float(table.t0), dt=system.dt)
-    labels = table.records.labels
     return xr.Dataset(
         {
             "states": (("row", "state"), states),
@@ -363,7 +366,7 @@ def _simulate_panel(
         coords={
             "state": list(system.states),
             "observable": list(system.observables),
-            **coords_of("row", labels, n_steps),
-            **coords_of("obs", labels, [record[0] for record in records], "obs_"),
+            **table.coords("row", n_steps),
+            **table.coords("obs", [axis.steps for axis in table.axes], "obs_"),
         },
     )

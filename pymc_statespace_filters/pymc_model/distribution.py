@@ -17,12 +17,13 @@ from ..evaluation.filter_warnings import warn_of_choice
 from ..filters.protocol import Filter
 from ..filters.recommendation import check_system_and_filter
 from ..system.checks import is_integer
+from ..system.clock import Clock
 from ..system.model import StateSpaceModel
 from ..system.panel import SymbolicPanel, symbolic_panel
 from ..system.parameters import check_names, symbolic_panel_parameters, symbolic_parameters
 from ..system.record import check_seed, symbolic_record
 from . import dispatch as dispatch  # registers draw and density
-from .random_variable import PanelRV, StateSpaceRV
+from .random_variable import NUMBERS, PanelRV, StateSpaceRV
 
 
 class StateSpace(Continuous):
@@ -43,8 +44,13 @@ class StateSpace(Continuous):
     params : mapping, optional
         Parameters by name, numbers or expressions. A parameter not named here is the variable of
         that name in the PyMC model, else the default in the function's signature.
-    steps, times : array_like, shape (J,)
-        Steps or times of the observations; give exactly one of them. See `log_likelihood`.
+    steps : array_like of int, shape (J,)
+        Steps of the observations; the initial state holds at step 0. Give `steps` or `times`.
+    times : array_like, shape (J,)
+        Times of the observations, increasing: numbers, or dates (datetime64, an index of pandas or
+        xarray; with a time zone, in UTC). The index of ``observed`` if it holds dates. Off the grid
+        ``t0 + k * dt`` (by more than a millionth of a step) an integrator divides each gap into the
+        fewest equal steps of at most ``dt``; a transition that is a function has whole steps only.
     panel : array_like of int or str, shape (J,), optional
         For many records of one system: the label of the record of each row. The rows of a record
         are together, its steps increase, and it starts at step 0 and ``t0``. Parameters are then
@@ -59,8 +65,19 @@ class StateSpace(Continuous):
     inputs : array_like, shape (rows, n_inputs), optional
         Row k holds during step k; named columns are aligned. The records of a panel share them, or
         have one such array each: a mapping from labels, or a list in the order of the records.
-    t0 : float
-        Time of step 0.
+    t0 : float or date
+        Time of step 0. Of dates, a number is the model's time at the first date of each record, so
+        that by default a record starts, in the initial state, at its first row; a date is the start
+        of all records, at model time 0.
+    unit : str or pandas.Timedelta, optional
+        The duration of one unit of model time, where times are dates: ``"D"`` if ``dt`` and rates
+        count days.
+    input_times : array_like, shape (rows,), optional
+        Times of the rows of ``inputs``, numbers or dates, if they have their own; of a panel, as
+        ``inputs``, one array for all records or one for each.
+    inputs_at : {"hold", "linear"}
+        What inputs with times of their own are between these: the last value, or linear, of which a
+        step takes the value in its middle. A value that changes within a step ends the step there.
     seed : int
         Seed of the noise inside the filter; in a panel, the noise of each record depends on it and
         on the record's label. The model stores it as shared data ``{name}_seed``,
@@ -119,7 +136,10 @@ class StateSpace(Continuous):
         panel: Any = None,
         observed: Any = None,
         inputs: Any = None,
-        t0: float = 0.0,
+        t0: Any = 0.0,
+        unit: Any = None,
+        input_times: Any = None,
+        inputs_at: str = "hold",
         seed: int = 0,
         score_from: int = 0,
         dims: Sequence[str] | None = None,
@@ -136,27 +156,30 @@ class StateSpace(Continuous):
         others = tuple(model.named_vars)
         full_name = model.name_for(name)
         _check_name(model, full_name, name, system)
-        data = {"steps": steps, "times": times, "inputs": inputs, "t0": t0}
+        data = {
+            "steps": steps, "times": times, "inputs": inputs, "t0": t0, "unit": unit,
+            "input_times": input_times, "inputs_at": inputs_at,
+        }  # fmt: skip
         record: Any
         if panel is None:
             theta = symbolic_parameters(system, values, others)
             record = symbolic_record(system, observed, **data)
-            n_rows = record.current_steps.size
+            n_rows, t0 = record.axis.steps.size, record.axis.t0
             row_dim, component_dim = _dims(dims, f"{full_name}_time")
-            row_coords: Any = record.t0 + record.current_steps * system.dt
+            row_coords: Any = record.clock.shown(record.axis.times(record.axis.steps))
         else:
             record = symbolic_panel(system, panel, observed, **data)
             theta = symbolic_panel_parameters(system, values, record, others)
-            n_rows = int(np.diff(record.records.starts).max())
+            n_rows, t0 = int(np.diff(record.records.starts).max()), record.t0
             row_dim, component_dim = _dims(dims, f"{full_name}_obs")
-            row_coords = range(record.current_steps.size)
+            row_coords = range(int(record.records.starts[-1]))
         seed_array = check_seed("seed", seed)
         if seed_array.ndim:
             raise ModelError(f"seed must be one integer, got an array of shape {seed_array.shape}")
         _add_coord(model, row_dim, row_coords, name)
         _add_coord(model, component_dim, list(system.observables), name)
         if panel is not None:
-            _add_records(model, full_name, row_dim, record, system.dt)
+            _add_records(model, full_name, row_dim, record)
         noise_seed = _add_seed(model, full_name, seed_array) if filter.noisy else seed_array
         return super().__new__(
             cls,
@@ -164,11 +187,12 @@ class StateSpace(Continuous):
             theta,
             record.steps if panel is None else record.rows,
             record.inputs,
-            record.t0,
+            t0,
             noise_seed,
-            system=system,
+            system=record.system,
             filter=filter,
             score_from=_check_score_from(score_from, n_rows),
+            clock=record.clock,
             observed=record.observed,
             dims=(row_dim, component_dim),
         )
@@ -180,6 +204,7 @@ class StateSpace(Continuous):
         system: StateSpaceModel,
         filter: Filter,
         score_from: int = 0,
+        clock: Clock = NUMBERS,
         **kwargs: Any,
     ) -> Any:
         """Make the variable without a model; parameters are theta, steps, inputs, t0 and seed."""
@@ -188,7 +213,7 @@ class StateSpace(Continuous):
             pt.cast(p, dtype) if isinstance(p, Variable) else pt.as_tensor(np.asarray(p, dtype))
             for p, dtype in zip(params, dtypes, strict=True)
         ]
-        settings = {"system": system, "filter": filter, "score_from": score_from}
+        settings = {"system": system, "filter": filter, "score_from": score_from, "clock": clock}
         return super().dist(symbols, **settings, **kwargs)
 
     @classmethod
@@ -198,13 +223,14 @@ class StateSpace(Continuous):
         system: StateSpaceModel,
         filter: Filter,
         score_from: int,
+        clock: Clock,
         rng: Any = None,
         **kwargs: Any,
     ) -> TensorVariable:
         """Apply the operation; called by PyMC."""
         rng = pt.random.shared_rng(seed=None) if rng is None else rng
         kind = PanelRV if params[1].type.ndim == 2 else StateSpaceRV
-        operation = kind(system=system, filter=filter, score_from=score_from)
+        operation = kind(system=system, filter=filter, score_from=score_from, clock=clock)
         _, draw = operation(*params, rng=rng, return_next_rng=True, **kwargs)
         return draw
 
@@ -251,7 +277,7 @@ def _dims(dims: Sequence[str] | None, of_rows: str) -> tuple[str, str]:
     return row_dim, component_dim
 
 
-def _add_records(model: pm.Model, name: str, row_dim: str, panel: SymbolicPanel, dt: float) -> None:
+def _add_records(model: pm.Model, name: str, row_dim: str, panel: SymbolicPanel) -> None:
     """Add the labels of a panel, and the record and time of every row, to the model.
 
     Rows given as ``pm.Data`` are in the model already, and may change.
@@ -262,7 +288,8 @@ def _add_records(model: pm.Model, name: str, row_dim: str, panel: SymbolicPanel,
     of_rows = panel.records.of_rows()
     if isinstance(panel.records.labels[0], int):
         of_rows = panel.records.codes[of_rows]
-    for what, values in (("panel", of_rows), ("time", panel.t0 + panel.current_steps * dt)):
+    times = [axis.times(axis.steps) for axis in panel.axes]
+    for what, values in (("panel", of_rows), ("time", np.concatenate(times))):
         shared = pytensor.shared(values, name=f"{name}_{what}")
         model.register_data_var(shared, dims=(row_dim,))
 

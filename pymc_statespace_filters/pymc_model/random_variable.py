@@ -12,27 +12,38 @@ import numpy as np
 from pytensor.tensor.random.op import RandomVariable
 
 from ..filters.protocol import Filter
+from ..system.clock import Clock
 from ..system.model import StateSpaceModel
+
+NUMBERS = Clock()
 
 
 class StateSpaceRV(RandomVariable):
     """Draws data (J, p) from theta, steps, inputs and t0; its last input, the seed, is unused.
 
-    The log-density leaves out the terms of the first ``score_from`` rows.
+    The log-density leaves out the terms of the first ``score_from`` rows. ``clock`` turns model
+    times into those of the user, for results.
     """
 
     name = "StateSpace"
     signature = "(k),(j),(s,u),(),()->(j,p)"
     dtype = "float64"
-    __props__ = (*RandomVariable.__props__, "system", "filter", "score_from")
+    __props__ = (*RandomVariable.__props__, "system", "filter", "score_from", "clock")
     _print_name = ("StateSpace", "\\operatorname{StateSpace}")
 
     def __init__(
-        self, *, system: StateSpaceModel, filter: Filter, score_from: int = 0, **settings: Any
+        self,
+        *,
+        system: StateSpaceModel,
+        filter: Filter,
+        score_from: int = 0,
+        clock: Clock = NUMBERS,
+        **settings: Any,
     ) -> None:
         self.system = system
         self.filter = filter
         self.score_from = score_from
+        self.clock = clock
         super().__init__(**settings)
 
     def __str__(self) -> str:

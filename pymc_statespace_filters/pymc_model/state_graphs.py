@@ -22,6 +22,7 @@ from ..filters.protocol import (
 from ..filters.recommendation import check_system_and_filter
 from ..ops.likelihood import LogLikelihood, TapedLogLikelihood
 from ..ops.states import Predictions, States, TermHealth
+from ..system.clock import Clock
 from ..system.model import StateSpaceModel
 from .inspection import state_space_nodes
 
@@ -45,6 +46,7 @@ class StateSpaceVariable(NamedTuple):
     seed: TensorVariable
     observed: TensorVariable
     score_from: int
+    clock: Clock
 
     @property
     def is_panel(self) -> bool:
@@ -63,7 +65,9 @@ def observed_variables(model: pm.Model) -> list[StateSpaceVariable]:
             record = (theta, steps, inputs, t0, seed, model.rvs_to_values[rv])
             op = node.op
             found.append(
-                StateSpaceVariable(name, op.system, op.filter, dims, *record, op.score_from)
+                StateSpaceVariable(
+                    name, op.system, op.filter, dims, *record, op.score_from, op.clock
+                )
             )
     return found
 

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
-import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pytensor.graph.basic import Variable
 from pytensor.graph.replace import clone_replace
@@ -18,7 +17,7 @@ from ..errors import ModelError
 from ..filters.ekf import EKF
 from ..filters.protocol import EnsembleFilter, Filter
 from ..filters.signatures import PANEL
-from ..system.accumulators import without_resets
+from ..system.input_columns import divided, without_resets
 from ..system.integrators.substeps import CoupledNoise
 from ..system.model import StateSpaceModel
 from ..system.panel_records import FIRST_INPUT, RECORD, STEP
@@ -128,10 +127,7 @@ def _with_shorter_steps(node: Any, system: StateSpaceModel) -> list[Variable]:
     factor = round(system.dt / single.dt)
     theta, steps, observed, inputs, *others = node.inputs
     node.op.filter.check(compile_system(single))
-    rows = pt.repeat(inputs, factor, axis=0)
-    if system.accumulators:
-        begins_step = pt.eq(pt.arange(rows.shape[0]) % factor, 0)
-        rows = pt.set_subtensor(rows[:, -1], rows[:, -1] * begins_step)
+    rows = divided(system, inputs, factor)
     # The rows of a panel have a column of records before those of steps and inputs.
     factors = factor if steps.type.ndim == 1 else np.array([1, factor, factor])
     likelihood = node.op.of(single, node.op.filter)
@@ -206,13 +202,14 @@ def path_eigenvalues(
     start, advance, jacobian = _compile_path(single, _examined(system))
     if inputs.shape[1] == 0:  # a system without inputs
         inputs = np.zeros((len(theta), 1, system.n_input_columns))
-    inputs = without_resets(system, inputs)  # which belong to a step, not to each substep
+    n_steps = min(int(steps.max(initial=0)) * substeps, MAX_STEPS)
+    rows = without_resets(system, inputs[:, : n_steps // substeps + 1])
+    inputs = divided(system, rows, substeps)
     x = start(theta)
     eigenvalues = []
-    n_steps = min(int(steps.max(initial=0)) * substeps, MAX_STEPS)
     with np.errstate(all="ignore"):
         for k in range(n_steps + 1):
-            now = theta, x, inputs[:, min(k // substeps, inputs.shape[1] - 1)], t0 + k * length
+            now = theta, x, inputs[:, min(k, inputs.shape[1] - 1)], t0 + k * length
             if k % STEPS_PER_JACOBIAN == 0 or k == n_steps:
                 eigenvalues.append(_eigenvalues(jacobian(*now)))
             x = advance(*now)

@@ -11,7 +11,7 @@ from ..pymc_model.state_graphs import observed_variables, smoothing_method
 from ..system.checks import check_random_seed
 from ..system.steps import check_at, rows_at
 from .draws import select_draws
-from .groups import add_group, join_rows, row_coords, state_dims
+from .groups import add_group, coords_of_steps, join_rows, state_dims
 from .variable import VariableAtDraws, select_variables
 
 
@@ -196,7 +196,7 @@ def _add_states(
                 f"{name}_sd": ((time, state), join_rows(sd)),
                 f"{name}_n_effective": ((time,), join_rows(n_effective)),
             },
-            {**row_coords(at_draws, steps), state: list(system.states)},
+            {**coords_of_steps(at_draws, steps), state: list(system.states)},
         )
         part[f"{name}_states"].attrs = {"filter": repr(variable.filter)}
         if moment == "smoothed":

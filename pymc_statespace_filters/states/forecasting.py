@@ -13,7 +13,12 @@ from ..evaluation.simulate import continuation
 from ..pymc_model.inspection import given_model
 from ..pymc_model.state_graphs import observed_variables
 from ..system.checks import check_random_seed, is_integer
-from ..system.steps import steps_of
+from ..system.model import StateSpaceModel
+from ..system.panel import of_each_record
+from ..system.placement import check_takes
+from ..system.steps import GRID_TOLERANCE, check_steps
+from ..system.time_axis import TimeAxis, TimesBetween, axis_of, check_increasing, is_grid
+from ..system.timed_inputs import check_inputs_at, timed_inputs
 from .draws import select_draws
 from .groups import add_group, join_rows, row_coords, state_dims
 from .record import Array, RecordAtDraws
@@ -28,6 +33,8 @@ def forecast(
     steps: Any = None,
     times: Any = None,
     inputs: Any = None,
+    input_times: Any = None,
+    inputs_at: str = "hold",
     var_name: str | None = None,
     filter: Any = None,
     n_draws: int | None = None,
@@ -49,10 +56,12 @@ def forecast(
     steps : array_like of int, shape (R,), optional
         Steps after the last observation, increasing.
     times : array_like, shape (R,), optional
-        Times after the last observation, on the grid ``t0 + k * dt``.
+        Times after the last observation, numbers or dates as those of the model.
     inputs : array_like, shape (rows, n_inputs), optional
         Inputs from step 0 on, past and future, row k during step k; required if those of the model
         end before the last step. Of a panel also an array for each record, as in `StateSpace`.
+    input_times, inputs_at
+        Times of the rows of `inputs`, and what inputs are between them, as in `StateSpace`.
 
     Returns
     -------
@@ -101,21 +110,32 @@ def forecast(
     for variable in select_variables(model, var_name, filter):
         name, system, (time, observable) = variable.name, variable.system, variable.dims
         at_draws = VariableAtDraws(model, variable, draws)
-        future = [_future_steps(n_steps, steps, times, record) for record in at_draws.records]
-        observations = [
-            np.concatenate([record.steps, rows])
-            for record, rows in zip(at_draws.records, future, strict=True)
+        timed = _timed_inputs(at_draws, inputs, input_times, inputs_at)
+        axes = [
+            _future_axis(n_steps, steps, times, record, changes)
+            for record, (_, changes) in zip(at_draws.records, timed, strict=True)
+        ]
+        if input_times is not None:
+            pairs = zip(timed, axes, at_draws.records, strict=True)
+            inputs = [one.rows(axis, variable.clock, r.number) for (one, _), axis, r in pairs]
+            inputs = inputs if variable.is_panel else inputs[0]
+        future = [axis.steps for axis in axes]
+        axes = [
+            axis._replace(steps=np.concatenate([record.steps, axis.steps]))
+            for record, axis in zip(at_draws.records, axes, strict=True)
         ]
         if inputs is not None:
-            at_draws = at_draws.with_inputs(inputs, observations)
+            at_draws = at_draws.with_inputs(inputs, axes)
         initial, paths, simulated = [], [], []
         with at_draws.progress("states", enabled=progressbar):
-            for rows, all_rows, record, own in zip(
-                future, observations, at_draws.records, at_draws.generators(rng), strict=True
+            for rows, axis, record, own in zip(
+                future, axes, at_draws.records, at_draws.generators(rng), strict=True
             ):
-                input_rows = record.inputs_until(all_rows)
+                input_rows = record.inputs_until(axis)
                 initial.append(record.states("filtered", record.steps[-1:], own))
-                path, seen = _simulate(record, initial[-1].drawn[:, 0], rows, input_rows, own)
+                ahead = system if axis.starts is None else system.at_any_times
+                start = initial[-1].drawn[:, 0]
+                path, seen = _simulate(record, ahead, start, rows, input_rows, own)
                 paths.append(path)
                 simulated.append(seen)
         parts.append(
@@ -125,7 +145,10 @@ def forecast(
                     f"{name}_states": ((time, dims[name]), join_rows(paths)),
                 },
                 {
-                    **row_coords(at_draws, future),
+                    **row_coords(
+                        at_draws,
+                        [axis.times(rows) for axis, rows in zip(axes, future, strict=True)],
+                    ),
                     dims[name]: list(system.states),
                     observable: list(system.observables),
                 },
@@ -135,35 +158,81 @@ def forecast(
     return add_group(idata, "predictions", xr.merge(parts), {}, extend_inferencedata)
 
 
-def _future_steps(
-    n_steps: int | None, steps: Any, times: Any, record: RecordAtDraws
-) -> NDArray[np.int64]:
-    """The steps to predict."""
-    last = int(record.steps[-1])
+def _timed_inputs(
+    at_draws: VariableAtDraws, inputs: Any, input_times: Any, inputs_at: Any
+) -> list[tuple[Any, Array]]:
+    """The inputs of each record if they have times of their own, and when they change."""
+    check_inputs_at(inputs_at)
+    records, variable = at_draws.records, at_draws.variable
+    if input_times is None:
+        return [(None, np.empty(0))] * len(records)
+    labels = [record.label for record in records]
+    n_inputs, clock = variable.system.n_inputs, variable.clock
+    found = [
+        timed_inputs(own, times, inputs_at, n_inputs, clock, record.number)
+        for own, times, record in zip(
+            of_each_record("inputs", inputs, labels),
+            of_each_record("input_times", input_times, labels),
+            records,
+            strict=True,
+        )
+    ]
+    return [(one, one.changes()) for one in found]
+
+
+def _future_axis(
+    n_steps: int | None, steps: Any, times: Any, record: RecordAtDraws, changes: Array
+) -> TimeAxis:
+    """The axis of a record and its future, with the steps to predict."""
+    past, system = record.axis, record.variable.system
+    last, end = int(record.steps[-1]), float(past.times(record.steps[-1]))
     if sum(given is not None for given in (n_steps, steps, times)) != 1:
         raise ModelError("give exactly one of n_steps, steps and times")
     if n_steps is not None:
         if not is_integer(n_steps) or n_steps < 1:
             raise ModelError(f"n_steps must be an integer of at least 1, got {n_steps!r}")
-        return np.arange(last + 1, last + 1 + n_steps)
-    future = steps_of(steps, times, record.variable.system.dt, record.t0)
-    if future[0] <= last:
+        steps = np.arange(last + 1, last + 1 + n_steps)
+    if steps is not None:
+        steps = check_steps(steps)
+        numbers = end + system.dt * (steps - last)
+    else:
+        numbers = record.variable.clock.numbers("times", times, record.number)
+    if numbers.size == 0 or numbers[0] <= end + GRID_TOLERANCE * system.dt:
+        name, at, got = "steps", f"step {last}", [] if steps is None else steps
+        if steps is None:
+            name, at, got = "times", str(record.shown(end)), record.shown(numbers)
         raise ModelError(
-            f"{record.prefix}steps must be after the last observation, at step {last}, got "
-            f"{future[0]}: for earlier states use filtered_states or smoothed_states"
+            f"{record.prefix}{name} must be after the last observation, at {at}, got "
+            f"{got[0] if len(got) else 'none'}: for earlier states use filtered_states or "
+            "smoothed_states"
         )
-    return future
+    check_increasing("times", numbers, record.shown)
+    changes = changes[(changes > end) & (changes < numbers[-1])]
+    if system.is_at_any_times:
+        return past.followed_by(numbers, changes)
+    given = TimesBetween(None, numbers, record.t0, changes)
+    if is_grid([given], system.dt):
+        return axis_of(given, system.dt, on_grid=True)
+    check_takes(system, given, record.variable.clock, record.number)
+    if system.n_inputs:
+        raise ModelError(
+            f"{record.prefix}times to predict, and changes of the inputs, must lie on the grid of "
+            f"steps of a model with inputs whose record does, t0 = {record.t0:g} and dt = "
+            f"{system.dt:g}, got times {record.shown(numbers)}"
+        )
+    return past.followed_by(numbers, changes)
 
 
 def _simulate(
     record: RecordAtDraws,
+    system: StateSpaceModel,
     initial: Array,
     future: NDArray[np.int64],
     rows: Array,
     rng: np.random.Generator,
 ) -> tuple[Array, Array]:
     """Simulate states (draws, R, n) and observations (draws, R, p) from states (draws, n)."""
-    system, t0, first = record.variable.system, record.t0, int(record.steps[-1])
+    t0, first = record.t0, int(record.steps[-1])
     theta, simulate = record.theta, continuation(system).function
     paths = np.full((len(initial), future.size, system.n), np.nan)
     observed = np.full((len(initial), future.size, system.p), np.nan)

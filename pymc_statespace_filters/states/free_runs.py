@@ -15,9 +15,12 @@ from ..evaluation.simulate import simulator
 from ..parallel.cpu_affinity import available_cores
 from ..pymc_model.inspection import given_model
 from ..pymc_model.state_graphs import observed_variables
-from ..system.checks import check_flag, check_random_seed
-from ..system.record import check_observed
-from ..system.steps import steps_of
+from ..system.checks import check_flag, check_random_seed, shortened
+from ..system.model import StateSpaceModel
+from ..system.panel import of_each_record
+from ..system.placement import Placement, Timing, place_by
+from ..system.record import check_inputs, check_observed
+from ..system.timed_inputs import check_inputs_at
 from .draws import SAMPLE_DIMS, select_draws
 from .groups import add_group, by_record, join_rows, row_coords, state_dims
 from .record import Array, RecordAtDraws, simulate_observations
@@ -29,6 +32,8 @@ def free_run(
     model: pm.Model | None = None,
     *,
     inputs: Any = None,
+    input_times: Any = None,
+    inputs_at: str = "hold",
     steps: Any = None,
     times: Any = None,
     observed: Any = None,
@@ -54,7 +59,9 @@ def free_run(
         When to predict an observation, from step 0 of the simulation on; by default the steps of
         the variable's record. Accumulators sum from one of them to the next.
     times : array_like, shape (R,), optional
-        The same as times, on the grid ``t0 + k * dt``. Give at most one of `steps` and `times`.
+        The same as times, numbers or dates as those of the model. Give at most one of both.
+    input_times, inputs_at
+        Times of the rows of `inputs`, and what inputs are between them, as in `StateSpace`.
     observed : array_like, shape (R, p) or (R,), optional
         Measurements at these steps, to compare the predictions with; NaN where missing. By default
         the record of the model from ``score_from`` on, if the run has its inputs and steps, else
@@ -145,24 +152,32 @@ def free_run(
     parts = []
     for variable in variables:
         at_draws = VariableAtDraws(model, variable, draws)
-        at = [_steps(record, steps, times) for record in at_draws.records]
-        if inputs is not None:
-            at_draws = at_draws.with_inputs(inputs, at)
+        placed = _placed(at_draws, steps, times, inputs, input_times, inputs_at)
         name, (time, observable) = variable.name, variable.dims
         names: dict[str, Any] = {observable: list(variable.system.observables)}
         paths, seen, errors = [], [], []
-        for rows, record, own in zip(at, at_draws.records, at_draws.generators(rng), strict=True):
+        for one, record, own in zip(
+            placed, at_draws.records, at_draws.generators(rng), strict=True
+        ):
+            (axis,), system = one.axes, one.system
+            rows = axis.steps
             measured = _measured(record, observed, rows) if is_compared else None
+            if one.inputs[0] is None:
+                input_rows = record.inputs_until(axis)
+            else:
+                input_rows = check_inputs(one.inputs[0], system, axis)[None]
             # A copy: the simulator would be compiled again for arrays of another layout.
-            input_rows = np.array(record.inputs_until(rows), order="C")
-            path, values = _simulate(record, rows, input_rows, with_noise, draws.shape[0], own)
+            input_rows = np.array(input_rows, order="C")
+            path, values = _simulate(
+                record, system, rows, input_rows, with_noise, draws.shape[0], own
+            )
             paths.append(path)
             seen.append(values)
             if measured is not None:
                 noisy = (
                     values
                     if with_noise
-                    else simulate_observations(record, path, rows, input_rows, own)
+                    else simulate_observations(record, system, path, rows, input_rows, own)
                 )
                 predicted = draws.dataset({name: ((time, observable), values)}, names)[name]
                 errors.append(prediction_errors(predicted, noisy, measured))
@@ -173,7 +188,11 @@ def free_run(
                 name: ((time, observable), join_rows(seen)),
                 f"{name}_states": ((time, state), join_rows(paths)),
             },
-            {**row_coords(at_draws, at), **names, state: list(variable.system.states)},
+            {
+                **row_coords(at_draws, [one.axes[0].times(one.axes[0].steps) for one in placed]),
+                **names,
+                state: list(variable.system.states),
+            },
         )
         if errors:
             part = part.merge(by_record(at_draws, errors))
@@ -182,13 +201,44 @@ def free_run(
     return add_group(idata, "free_run", xr.merge(parts), attrs, extend_inferencedata)
 
 
-def _steps(record: RecordAtDraws, steps: Any, times: Any) -> NDArray[np.int64]:
-    """The steps to predict, those of the record by default."""
-    if steps is None and times is None:
-        return np.array(record.steps)
+def _placed(
+    at_draws: VariableAtDraws,
+    steps: Any,
+    times: Any,
+    inputs: Any,
+    input_times: Any,
+    inputs_at: Any,
+) -> list[Placement]:
+    """Where each record runs, by default that of the data; its inputs are None if the model's."""
+    variable, records = at_draws.variable, at_draws.records
     if steps is not None and times is not None:
         raise ModelError("give at most one of steps and times, got both")
-    return steps_of(steps, times, record.variable.system.dt, record.t0)
+    check_inputs_at(inputs_at)
+    labels = [record.label for record in records]
+    own_inputs = of_each_record("inputs", inputs, labels)
+    own_times = of_each_record("input_times", input_times, labels)
+    found = []
+    for record, rows, row_times in zip(records, own_inputs, own_times, strict=True):
+        system, at = variable.system, steps
+        if steps is None and times is None:
+            if input_times is None:
+                found.append(Placement(system, variable.clock, [record.axis], [rows]))
+                continue
+            if system.is_at_any_times:
+                times = record.shown(record.axis.times(record.steps))
+            else:
+                at = record.steps
+        elif steps is not None and system.is_at_any_times:
+            raise ModelError(
+                f"{record.prefix}steps must be None for a record at times off the grid, got "
+                f"{shortened(steps)}: give times"
+            )
+        timing = Timing(
+            None if at is None else [at], None if at is not None else [times], record.t0, None,
+            [rows], None if row_times is None else [row_times], inputs_at,
+        )  # fmt: skip
+        found.append(place_by(variable.clock, record.t0, system, timing, [record.number]))
+    return found
 
 
 def _measured(record: RecordAtDraws, observed: Any, steps: NDArray[np.int64]) -> Array:
@@ -200,6 +250,7 @@ def _measured(record: RecordAtDraws, observed: Any, steps: NDArray[np.int64]) ->
 
 def _simulate(
     record: RecordAtDraws,
+    system: StateSpaceModel,
     steps: NDArray[np.int64],
     rows: Array,
     noise: bool,
@@ -210,7 +261,7 @@ def _simulate(
 
     NaN for a draw with a number that is not finite.
     """
-    system, t0, theta = record.variable.system, record.t0, record.theta
+    t0, theta = record.t0, record.theta
     run = simulator(system, noise).function
     paths = np.empty((len(theta), steps.size, system.n))
     seen = np.empty((len(theta), steps.size, system.p))

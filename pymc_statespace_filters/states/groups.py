@@ -22,23 +22,31 @@ def state_dims(variables: Sequence[StateSpaceVariable]) -> dict[str, str]:
     }
 
 
-def row_coords(at_draws: VariableAtDraws, steps: Sequence[NDArray[np.int64]]) -> dict[str, Any]:
-    """Coordinates of the rows of a result, given the steps of each record.
+def coords_of_steps(
+    at_draws: VariableAtDraws, steps: Sequence[NDArray[np.int64]]
+) -> dict[str, Any]:
+    """Coordinates of the rows of a result, given the steps of each record in the data."""
+    pairs = zip(at_draws.records, steps, strict=True)
+    return row_coords(at_draws, [record.axis.times(rows) for record, rows in pairs])
+
+
+def row_coords(at_draws: VariableAtDraws, times: Sequence[Array]) -> dict[str, Any]:
+    """Coordinates of the rows of a result, given the times of each record.
 
     Without a panel they are times. The rows of a panel have record and time as further coordinates.
     """
     name, dim = at_draws.variable.name, at_draws.variable.dims[0]
-    pairs = list(zip(at_draws.records, steps, strict=True))
-    times = np.concatenate([record.times(rows) for record, rows in pairs])
+    pairs = list(zip(at_draws.records, times, strict=True))
+    shown = np.concatenate([record.shown(own) for record, own in pairs])
     if not at_draws.variable.is_panel:
-        return {dim: times}
+        return {dim: shown}
     labels = np.repeat(
-        np.array([record.label for record in at_draws.records]), [len(rows) for rows in steps]
+        np.array([record.label for record in at_draws.records]), [len(own) for own in times]
     )
     return {
-        dim: np.arange(times.size),
+        dim: np.arange(shown.size),
         f"{name}_panel": (dim, labels),
-        f"{name}_time": (dim, times),
+        f"{name}_time": (dim, shown),
     }
 
 

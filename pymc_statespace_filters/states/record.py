@@ -14,7 +14,9 @@ from ..compiler.numerics.philox import seed_of_record
 from ..errors import ModelError
 from ..evaluation.simulate import observer
 from ..pymc_model.state_graphs import StateSpaceVariable, states_of, term_health_of
-from ..system.accumulators import inputs_of_user, n_input_rows, with_resets
+from ..system.input_columns import inputs_of_user, n_input_rows, with_columns
+from ..system.model import StateSpaceModel
+from ..system.time_axis import TimeAxis
 
 if TYPE_CHECKING:
     from .variable import VariableAtDraws
@@ -94,21 +96,34 @@ class RecordAtDraws:
         """Input rows at every draw, (draws or 1, rows, n_input_columns)."""
         return self.at_draws.inputs[:, self.input_rows]
 
-    def times(self, rows: NDArray[np.int64]) -> Array:
-        """Times of the given steps."""
-        return np.asarray(self.t0 + rows * self.variable.system.dt, dtype=np.float64)
+    @property
+    def axis(self) -> TimeAxis:
+        """The steps of the record in time."""
+        system = self.variable.system
+        if not system.is_at_any_times:
+            return TimeAxis(self.steps, self.t0, system.dt)
+        columns = self.inputs[0, : self.steps[-1] + 1, system.n_inputs :]
+        lengths, starts = columns[:, 0].copy(), columns[:, 1].copy()
+        lengths[-1] = 0.0
+        return TimeAxis(self.steps, self.t0, system.dt, starts, lengths)
 
-    def inputs_until(self, steps: NDArray[np.int64]) -> Array:
-        """The inputs for observations at `steps` instead; checked to have the rows they need."""
+    def shown(self, times: Any) -> Any:
+        """The user's times."""
+        return self.variable.clock.shown(times, self.number)
+
+    def inputs_until(self, axis: TimeAxis) -> Array:
+        """The inputs for the observations of an axis; checked to have the rows they need."""
         system = self.variable.system
         rows = inputs_of_user(system, self.inputs)
-        if len(rows[0]) < n_input_rows(system, steps) and system.n_inputs:
+        if len(rows[0]) < n_input_rows(system, axis.steps) and system.n_inputs:
             raise ModelError(
                 f"{self.prefix}the model's inputs end after {len(rows[0])} rows, and step "
-                f"{steps[-1]} needs {n_input_rows(system, steps)}: give inputs= for all steps, "
-                "from step 0 on"
+                f"{axis.steps[-1]} needs {n_input_rows(system, axis.steps)}: give inputs= for all "
+                "steps, from step 0 on, or from the first time on with input_times="
             )
-        return with_resets(system, rows, steps)
+        if axis.starts is None:
+            return with_columns(system, rows, axis)
+        return with_columns(system.at_any_times, rows[:, : axis.starts.size], axis)
 
     @property
     def prefix(self) -> str:
@@ -175,13 +190,16 @@ def _term_health(variable: StateSpaceVariable) -> Graphs:
 
 def simulate_observations(
     record: RecordAtDraws,
+    system: StateSpaceModel,
     states: Array,
     steps: NDArray[np.int64],
     rows: Array,
     rng: np.random.Generator,
 ) -> Array:
-    """Simulate an observation (draws, R, p) of each state (draws, R, n); NaN where that is NaN."""
-    system = record.variable.system
+    """Simulate an observation (draws, R, p) of each state (draws, R, n); NaN where that is NaN.
+
+    ``system`` is the record's, or that at any times, whose inputs are ``rows``.
+    """
     observe = observer(system).function
     simulated = np.full((*states.shape[:2], system.p), np.nan)
     for i, path in enumerate(states):

@@ -26,6 +26,7 @@ from ..pymc_model.state_graphs import StateSpaceVariable, observed_variables, wi
 from ..system.panel import panel_inputs
 from ..system.panel_records import FIRST_INPUT, RECORD, STEP, records_of
 from ..system.record import check_inputs
+from ..system.time_axis import TimeAxis
 from .draws import SAMPLE_DIMS, PosteriorDraws
 from .record import Array, Graphs, RecordAtDraws
 
@@ -84,18 +85,18 @@ class VariableAtDraws:
             return self._interpret(graph)
         return pytensor.function([], graph, mode="FAST_COMPILE")()[None]
 
-    def with_inputs(self, inputs: Any, steps: Sequence[NDArray[np.int64]]) -> "VariableAtDraws":
-        """The same with other inputs, for observations at `steps` of every record."""
+    def with_inputs(self, inputs: Any, axes: Sequence[TimeAxis]) -> "VariableAtDraws":
+        """The same with other inputs, for observations on the axis of every record."""
         variable, system = self.variable, self.variable.system
         if variable.is_panel:
             table = variable.steps.eval(mode="FAST_COMPILE")
             own = [record.label for record in self.records]
             records = records_of(table[:, RECORD])._replace(labels=own)
-            rows, firsts = panel_inputs(inputs, system, records, steps)
+            rows, firsts = panel_inputs(inputs, system, records, axes)
             table[:, FIRST_INPUT] = 0 if firsts is None else firsts[records.of_rows()]
             changed = variable._replace(inputs=pt.as_tensor(rows), steps=pt.as_tensor(table))
         else:
-            rows = check_inputs(inputs, system, steps[0])
+            rows = check_inputs(inputs, system, axes[0])
             changed = variable._replace(inputs=pt.as_tensor(rows))
         return VariableAtDraws(self._model, changed, self.draws)
 

@@ -10,7 +10,7 @@ from .graph_digest import describe, digest
 from .integrators.protocol import Integrator, bound_to_states
 from .labels import default_names
 from .signature import checked_names, names_of_states, read_signature, size_of
-from .tracing import Equations, read, size, trace
+from .tracing import INPUT_ROW, Equations, read, size, trace
 
 
 @dataclass(init=False, repr=False)
@@ -113,28 +113,54 @@ class StateSpaceModel:
         carried: Sequence[str] = (),
         accumulators: Sequence[str] = (),
     ) -> None:
-        written = {
-            "transition": bound_to_states(transition, states),
-            "observation": observation,
-            "observation_noise": observation_noise,
-            "observation_dist": observation_dist,
-            "observation_logp": observation_logp,
-            "process_noise": process_noise,
-            "process_dist": process_dist,
-            "dt": dt,
-            "initial_mean": initial_mean,
-            "initial_cov": initial_cov,
-            "initial_dist": initial_dist,
-        }
+        self._trace(
+            {
+                "transition": bound_to_states(transition, states),
+                "observation": observation,
+                "observation_noise": observation_noise,
+                "observation_dist": observation_dist,
+                "observation_logp": observation_logp,
+                "process_noise": process_noise,
+                "process_dist": process_dist,
+                "dt": dt,
+                "initial_mean": initial_mean,
+                "initial_cov": initial_cov,
+                "initial_dist": initial_dist,
+            },
+            states=states,
+            observables=observables,
+            inputs=inputs,
+            shapes=shapes,
+            carried=carried,
+            accumulators=accumulators,
+        )
+
+    def _trace(
+        self,
+        written: Mapping[str, Any],
+        *,
+        states: Sequence[str] | None,
+        observables: Sequence[str] | None,
+        inputs: Sequence[str] | None,
+        shapes: Mapping[str, Sequence[int]] | None,
+        carried: Sequence[str],
+        accumulators: Sequence[str],
+        at_any_times: bool = False,
+    ) -> None:
+        """Set all fields, from what the user wrote."""
         functions = read(**written)
         signature = read_signature(functions.equations, shapes, inputs)
-        symbols = size(functions, signature, bool(accumulators))
+        symbols = size(
+            functions, signature, has_accumulators=bool(accumulators), at_any_times=at_any_times
+        )
         state_names = checked_names("states", states, default_names("x", symbols.n))
         totals = names_of_states("accumulators", accumulators, state_names)
         equations, seen = trace(
             functions, symbols, observables, [state_names.index(name) for name in totals]
         )
         p, r = seen.datum.type.shape[0], seen.noise.type.shape[0]
+        # Of a system at any times, the time of a step is in a column of inputs.
+        from_inputs = {"u", "t"} if at_any_times else {"u"}
         self._set(
             parameters=signature.parameters,
             defaults=signature.defaults,
@@ -153,14 +179,16 @@ class StateSpaceModel:
             additive_noise=seen.additive,
             discrete_noise=symbols.drawn is not None and symbols.drawn.is_discrete,
             gaussian_observation=seen.gaussian,
-            observation_uses_inputs=any("u" in e.symbols for e in functions.observation.equations),
+            observation_uses_inputs=any(
+                from_inputs.intersection(e.symbols) for e in functions.observation.equations
+            ),
             keeps_noises=False,
             equations=equations,
         )
         names = {"states": states, "observables": observables, "inputs": inputs}
-        # For `with_integrator` alone: neither compared nor pickled.
         others = {"shapes": shapes, "carried": carried, "accumulators": accumulators}
-        self._set(_arguments=written | names | others)
+        # To trace it again, with another integrator or at any times: neither compared nor pickled.
+        self._set(_written=written, _settings=names | others)
 
     # Equality and hash are those of the fields, which `__init__` sets once.
     parameters: tuple[str, ...]
@@ -217,7 +245,7 @@ class StateSpaceModel:
         None where the transition is a function, and after unpickling: a pickle holds the traced
         equations alone.
         """
-        transition = self.__dict__.get("_arguments", {}).get("transition")
+        transition = self.__dict__.get("_written", {}).get("transition")
         return transition if isinstance(transition, Integrator) else None
 
     @property
@@ -269,14 +297,49 @@ class StateSpaceModel:
         """
         if self.integrator is None:
             raise ModelError(f"{self!r} must have an integrator, got a transition without one")
-        system = StateSpaceModel(**self.__dict__["_arguments"] | {"transition": integrator})
+        system = self._traced_again(self.is_at_any_times, transition=integrator)
         system._set(keeps_noises=keeps_noises)
+        return system
+
+    @cached_property
+    def at_any_times(self) -> "StateSpaceModel":
+        """The same system with steps of any length, which is a column of inputs, as is their time.
+
+        See `input_columns`.
+        """
+        if self.is_at_any_times:
+            return self
+        system = self._traced_again(True)
+        system._set(keeps_noises=self.keeps_noises)
+        return system
+
+    @property
+    def why_one_length(self) -> str | None:
+        """Why the steps of this system have one length; None if they may have any."""
+        integrator = self.integrator
+        if self.is_at_any_times or hasattr(integrator, "at_length"):
+            return None
+        if integrator is not None:
+            return f"{type(integrator).__name__} has no steps of other lengths (at_length)"
+        if "_written" not in self.__dict__:
+            return "the steps of a system that was unpickled have one length"
+        return "the steps of a transition that is a function have one length"
+
+    def _traced_again(self, at_any_times: bool, **changes: Any) -> "StateSpaceModel":
+        system = object.__new__(StateSpaceModel)
+        own = self.__dict__
+        system._trace(own["_written"] | changes, **own["_settings"], at_any_times=at_any_times)
         return system
 
     @property
     def n_input_columns(self) -> int:
-        """Number of inputs, and the column of resets of a system with accumulators."""
-        return self.n_inputs + bool(self.accumulators)
+        """Number of inputs, and of the columns behind them, see `input_columns`."""
+        return self.equations.transition.inputs[INPUT_ROW].type.shape[0]
+
+    @property
+    def is_at_any_times(self) -> bool:
+        """Whether length and time of a step are columns of inputs."""
+        return self.n_input_columns > self.n_inputs + bool(self.accumulators)
 
     @property
     def n_theta(self) -> int:

@@ -3,7 +3,7 @@
 The rows of a panel are a table of integers (J, 3), one for each observation: a code of the record
 that it belongs to, its step, and the row of the inputs that holds during step 0 of that record.
 Records that share their inputs all begin at row 0; others have stretches of their own, one below
-the other. Every record starts at step 0 and time t0.
+the other. Every record starts at step 0 and time t0; at dates, at its own first date.
 
 The code of a record is its label, or a hash of it if that is a text. The noise of a record depends
 on the seed and this code alone, so that it does not change when other records are added.
@@ -21,54 +21,62 @@ from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
-from .checks import check_finite, shortened
+from .checks import shortened
+from .clock import Clock, are_dates
 from .model import StateSpaceModel
 from .panel_records import FIRST_INPUT, STEP, Records, records_of
+from .placement import Earlier, Placement, Timing, place
 from .record import check_inputs, check_observed, inputs_of_other_shape
-from .steps import check_steps, steps_of
+from .time_axis import TimeAxis
 
 
-def _own_inputs(inputs: Any, records: Records) -> list[Any] | None:
+def of_each_record(name: str, values: Any, labels: Sequence[Any]) -> list[Any]:
+    """The inputs of each record, or their times: their own, or the same for all.
+
+    A single record has the label None.
+    """
+    own = None if list(labels) == [None] else _own_inputs(values, labels, name)
+    return [values] * len(labels) if own is None else own
+
+
+def _own_inputs(inputs: Any, labels: Sequence[Any], name: str = "inputs") -> list[Any] | None:
     """The inputs of each record, if they have their own: a mapping or a sequence of arrays."""
     if isinstance(inputs, Mapping):
-        if list(inputs) != records.labels and set(inputs) != set(records.labels):
-            missing = [label for label in records.labels if label not in inputs]
+        if set(inputs) != set(labels):
+            missing = [label for label in labels if label not in inputs]
             raise ModelError(
-                f"inputs must have an array for each record, got none for {shortened(missing)}"
+                f"{name} must have an array for each record, got none for {shortened(missing)}"
                 if missing
-                else f"inputs must have an array for each record, got others: {shortened(inputs)}"
+                else f"{name} must have an array for each record, got others: {shortened(inputs)}"
             )
-        return [inputs[label] for label in records.labels]
+        return [inputs[label] for label in labels]
     is_list = isinstance(inputs, list | tuple) and all(
         isinstance(part, np.ndarray | Variable | pd.DataFrame | xr.DataArray) and part.ndim
         for part in inputs
     )
     if not is_list and not (isinstance(inputs, np.ndarray) and inputs.ndim == 3):
         return None
-    if len(inputs) != len(records.labels):
+    if len(inputs) != len(labels):
         raise ModelError(
-            f"inputs must have an array for each of the {len(records.labels)} records, or one for "
+            f"{name} must have an array for each of the {len(labels)} records, or one for "
             f"all, got {len(inputs)}"
         )
     return list(inputs)
 
 
 def panel_inputs(
-    inputs: Any, system: StateSpaceModel, records: Records, steps: Sequence[np.ndarray]
+    inputs: Any, system: StateSpaceModel, records: Records, axes: Sequence[TimeAxis]
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """All rows of inputs, and the first row of each record; None if all share them.
-
-    ``steps`` are the steps of the observations of each record.
-    """
-    own = _own_inputs(inputs, records)
+    """All rows of inputs, and the first row of each record; None if all share them."""
+    own = _own_inputs(inputs, records.labels)
     if own is None:
-        # The observations of one record do not reset the accumulators of another.
-        if not system.accumulators:
-            records.check_each(lambda rows: check_inputs(inputs, system, rows), steps)
-            longest = np.array([max(rows[-1] for rows in steps)])
+        # Lengths of steps, and observations that reset accumulators, are those of one record.
+        if system.n_input_columns == system.n_inputs:
+            records.check_each(lambda axis: check_inputs(inputs, system, axis), axes)
+            longest = max(axes, key=lambda axis: axis.steps[-1])
             return check_inputs(inputs, system, longest), None
         own = [inputs] * len(records.labels)
-    parts = records.check_each(lambda part, rows: check_inputs(part, system, rows), own, steps)
+    parts = records.check_each(lambda part, axis: check_inputs(part, system, axis), own, axes)
     return np.concatenate(parts), _first_rows([len(part) for part in parts])
 
 
@@ -77,16 +85,17 @@ def _first_rows(lengths: Sequence[int]) -> np.ndarray:
 
 
 def symbolic_panel_inputs(
-    inputs: Any, system: StateSpaceModel, records: Records, steps: Sequence[np.ndarray]
+    inputs: Any, system: StateSpaceModel, records: Records, axes: Sequence[TimeAxis]
 ) -> tuple[Any, Any]:
     """The same for symbols, of which what is known is checked."""
-    own = _own_inputs(inputs, records)
+    own = _own_inputs(inputs, records.labels)
     parts = [inputs] if own is None else own
     if not any(isinstance(part, Variable) for part in parts):
-        return panel_inputs(inputs, system, records, steps)
-    if system.accumulators:
+        return panel_inputs(inputs, system, records, axes)
+    if system.n_input_columns > system.n_inputs:
         raise ModelError(
-            "inputs must be numbers for a system with accumulators in a panel, got a symbol"
+            "inputs must be numbers in a panel of a system with accumulators or at times off the "
+            "grid, got a symbol"
         )
     current = [
         part.get_value() if isinstance(part, SharedVariable) else part
@@ -94,7 +103,7 @@ def symbolic_panel_inputs(
         if isinstance(part, SharedVariable) or not isinstance(part, Variable)
     ]
     if len(current) == len(parts):
-        panel_inputs(current[0] if own is None else current, system, records, steps)
+        panel_inputs(current[0] if own is None else current, system, records, axes)
     columns = [_two_dimensional(part, system) for part in parts]
     if own is None:
         return columns[0], None
@@ -112,13 +121,23 @@ def _two_dimensional(inputs: Any, system: StateSpaceModel) -> TensorVariable:
 
 
 class CheckedPanel(NamedTuple):
-    """A panel of numbers: its records, rows (J, 3), data (J, p), inputs and t0 ()."""
+    """A panel of numbers: its records on their axes, rows (J, 3), data (J, p) and inputs.
 
+    ``system`` is the one that takes the steps of these axes.
+    """
+
+    system: StateSpaceModel
+    clock: Clock
     records: Records
+    axes: list[TimeAxis]
     rows: np.ndarray
     observed: np.ndarray
     inputs: np.ndarray
-    t0: np.ndarray
+
+    @property
+    def t0(self) -> np.ndarray:
+        """The model time of step 0 of every record."""
+        return np.asarray(self.axes[0].t0)
 
     def single_records(self) -> list[tuple[np.ndarray, ...]]:
         """Steps, observed, inputs and t0 of every record, as a single one has them."""
@@ -132,35 +151,46 @@ class CheckedPanel(NamedTuple):
             for own in self.records.slices()
         ]
 
+    def coords(
+        self, dim: str, steps: Sequence[np.ndarray], prefix: str = ""
+    ) -> dict[str, tuple[str, np.ndarray]]:
+        """Coordinates of the rows of a result: record, step and time, given the steps by record."""
+        labels, at = np.array(self.records.labels), np.concatenate(steps)
+        return {
+            f"{prefix}record": (dim, np.repeat(labels, [len(one) for one in steps])),
+            f"{prefix}step": (dim, at),
+            f"{prefix}time": (dim, times_of_records(self.clock, self.axes, steps)),
+        }
+
 
 class SymbolicPanel(NamedTuple):
-    """A panel of numbers or symbols, with the current numbers of its records and steps."""
+    """A panel of numbers or symbols, with the current numbers of its records on their axes."""
 
+    system: StateSpaceModel
+    clock: Clock
+    axes: list[TimeAxis]
     records: Records
-    current_steps: np.ndarray
     n_records: Any
     rows: Any
     observed: Any
     inputs: Any
-    t0: float
+
+    @property
+    def t0(self) -> float:
+        """The model time of step 0 of every record."""
+        return self.axes[0].t0
+
+    def times(self) -> np.ndarray:
+        """The user's time of every row."""
+        return times_of_records(self.clock, self.axes, [axis.steps for axis in self.axes])
 
 
-def row_coords(
-    dim: str,
-    labels: Sequence[Any],
-    steps: Sequence[np.ndarray],
-    prefix: str = "",
-    *,
-    t0: float,
-    dt: float,
-) -> dict[str, tuple[str, np.ndarray]]:
-    """Coordinates of the rows of a result: record, step and time, given the steps by record."""
-    at = np.concatenate(steps)
-    return {
-        f"{prefix}record": (dim, np.repeat(np.array(labels), [len(one) for one in steps])),
-        f"{prefix}step": (dim, at),
-        f"{prefix}time": (dim, t0 + at * dt),
-    }
+def times_of_records(
+    clock: Clock, axes: Sequence[TimeAxis], steps: Sequence[np.ndarray]
+) -> np.ndarray:
+    """The user's times of the given steps of each record, one after the other."""
+    pairs = enumerate(zip(axes, steps, strict=True))
+    return np.concatenate([clock.shown(axis.times(own), g) for g, (axis, own) in pairs])
 
 
 def checked_panel(
@@ -168,21 +198,74 @@ def checked_panel(
     panel: Any,
     observed: Any,
     *,
+    steps: Any = None,
+    times: Any = None,
+    inputs: Any = None,
+    t0: Any = 0.0,
+    unit: Any = None,
+    input_times: Any = None,
+    inputs_at: Any = "hold",
+    earlier: Earlier | None = None,
+) -> CheckedPanel:
+    """Check every part of a panel of numbers; ``observed`` is None for a simulation."""
+    records = records_of(panel)
+    placed = _placed(
+        system, records, steps, times, inputs, t0, unit, input_times, inputs_at, earlier
+    )
+    if observed is None:
+        data = np.full((int(records.starts[-1]), system.p), np.nan)
+    else:
+        data = _check_observed(observed, system, records)
+    rows_of_user = inputs if input_times is None else placed.inputs
+    forces, first_inputs = panel_inputs(rows_of_user, placed.system, records, placed.axes)
+    number, at = records.of_rows(), np.concatenate([axis.steps for axis in placed.axes])
+    begin = np.zeros_like(at) if first_inputs is None else first_inputs[number]
+    rows = np.stack([records.codes[number], at, begin], axis=1)
+    return CheckedPanel(placed.system, placed.clock, records, placed.axes, rows, data, forces)
+
+
+def _placed(
+    system: StateSpaceModel,
+    records: Records,
     steps: Any,
     times: Any,
     inputs: Any,
     t0: Any,
-) -> CheckedPanel:
-    """Check every part of a panel of numbers."""
-    t0 = check_finite("t0", t0)
-    records = records_of(panel)
-    at = _steps(records, steps, times, system.dt, t0)
-    data = _check_observed(observed, system, records)
-    forces, first_inputs = panel_inputs(inputs, system, records, records.split(at))
-    number = records.of_rows()
-    begin = np.zeros_like(at) if first_inputs is None else first_inputs[number]
-    rows = np.stack([records.codes[number], at, begin], axis=1)
-    return CheckedPanel(records, rows, data, forces, np.asarray(t0))
+    unit: Any,
+    input_times: Any,
+    inputs_at: Any,
+    earlier: Earlier | None = None,
+) -> Placement:
+    """The axes of the records; with times of their own, also the inputs by step of each."""
+    if (steps is None) == (times is None):
+        raise ModelError("give exactly one of steps and times")
+    if isinstance(times, Variable):
+        raise ModelError("times must be numbers, got a symbol; give steps=pm.Data(...) instead")
+    own_inputs, own_times = [inputs] * len(records.labels), None
+    if input_times is not None:
+        own_inputs = of_each_record("inputs", inputs, records.labels)
+        own_times = of_each_record("input_times", input_times, records.labels)
+        if any(isinstance(part, Variable) for part in own_inputs):
+            raise ModelError("inputs must be numbers where input_times are given, got a symbol")
+    timing = Timing(
+        _by_record("steps", steps, records),
+        _by_record("times", times, records),
+        t0, unit, own_inputs, own_times, inputs_at, earlier,
+    )  # fmt: skip
+    return place(system, timing, records.check_each)
+
+
+def _by_record(name: str, values: Any, records: Records) -> list[Any] | None:
+    if values is None:
+        return None
+    array = values if are_dates(values) else np.asarray(values)
+    n_rows = int(records.starts[-1])
+    if np.shape(array) != (n_rows,):
+        raise ModelError(
+            f"{name} must have shape ({n_rows},), one for each row of panel, got shape "
+            f"{np.shape(array)}"
+        )
+    return [array[rows] for rows in records.slices()]
 
 
 def symbolic_panel(
@@ -194,21 +277,24 @@ def symbolic_panel(
     times: Any,
     inputs: Any,
     t0: Any,
+    unit: Any,
+    input_times: Any,
+    inputs_at: Any,
 ) -> SymbolicPanel:
     """Check every part of a panel as far as it is known: numbers and the values of shared data."""
-    t0 = check_finite("t0", t0)
-    if isinstance(times, Variable):
-        raise ModelError("times must be numbers, got a symbol; give steps=pm.Data(...) instead")
     records = records_of(_current(panel))
-    at = _steps(records, _current(steps), times, system.dt, t0)
+    current = _current(steps)
+    placed = _placed(system, records, current, times, inputs, t0, unit, input_times, inputs_at)
     data = None if observed is None else _symbolic_observed(observed, system, records)
+    system, axes = placed.system, placed.axes
     is_symbolic = isinstance(panel, Variable) or isinstance(steps, Variable)
-    if is_symbolic and system.accumulators:
+    if is_symbolic and system.n_input_columns > system.n_inputs:
         raise ModelError(
             "panel and steps must be numbers for a system with accumulators, which are reset at the"
-            " steps of each record, got pm.Data"
+            " steps of each record, and at times off the grid, got pm.Data"
         )
-    forces, first_inputs = symbolic_panel_inputs(inputs, system, records, records.split(at))
+    rows_of_user = inputs if input_times is None else placed.inputs
+    forces, first_inputs = symbolic_panel_inputs(rows_of_user, system, records, axes)
     if isinstance(panel, Variable):
         codes: Any = pt.cast(panel, "int64")
         begins = pt.neq(codes[1:], codes[:-1])
@@ -218,32 +304,16 @@ def symbolic_panel(
         n_records, number = len(records.labels), records.of_rows()
         codes = records.codes[number]
     begin = codes * 0 if first_inputs is None else pt.as_tensor(first_inputs)[number]
+    at = np.concatenate([axis.steps for axis in axes])
     columns = [codes, steps if isinstance(steps, Variable) else at, begin]
     rows: Any = pt.stack([pt.cast(pt.as_tensor(column), "int64") for column in columns], axis=1)
     if not any(isinstance(part, Variable) for part in (panel, steps, first_inputs)):
         rows = rows.eval(mode="FAST_COMPILE")
-    return SymbolicPanel(records, at, n_records, rows, data, forces, t0)
+    return SymbolicPanel(system, placed.clock, axes, records, n_records, rows, data, forces)
 
 
 def _current(value: Any) -> Any:
     return value.eval() if isinstance(value, Variable) else value
-
-
-def _steps(records: Records, steps: Any, times: Any, dt: float, t0: float) -> np.ndarray:
-    """Steps of all rows; those of a record increase strictly."""
-    if (steps is None) == (times is None):
-        raise ModelError("give exactly one of steps and times")
-    name, values = ("steps", steps) if times is None else ("times", times)
-    array = np.asarray(values)
-    n_rows = records.starts[-1]
-    if array.shape != (n_rows,):
-        raise ModelError(
-            f"{name} must have shape ({n_rows},), one for each row of panel, got shape "
-            f"{array.shape}"
-        )
-    check = check_steps if times is None else lambda own: steps_of(None, own, dt, t0)
-    parts = records.check_each(check, records.split(array))
-    return np.concatenate(parts)
 
 
 def _check_observed(observed: Any, system: StateSpaceModel, records: Records) -> np.ndarray:

@@ -8,6 +8,7 @@ import pandas as pd
 
 from ..errors import ModelError
 from .checks import shortened
+from .clock import are_dates
 from .panel_records import records_of
 from .steps import nearest_steps
 
@@ -18,8 +19,9 @@ def panel_from(
     record: str,
     time: str,
     values: str | Sequence[str],
-    dt: float,
-    t0: float = 0.0,
+    dt: float | None = None,
+    t0: Any = 0.0,
+    unit: Any = None,
 ) -> dict[str, Any]:
     """Arguments of a panel from a table in long format, one row for each observation.
 
@@ -30,22 +32,23 @@ def panel_from(
     record : str
         The column of labels of records, integers or texts.
     time : str
-        The column of times, in the unit of `dt`. Every record starts at ``t0`` by this clock: of
-        dates, subtract the start of each record before.
+        The column of times: numbers in the unit of the system's ``dt``, or dates.
     values : str or sequence of str
         The column of each observable; NaN where missing. Several have the names of the system's
         observables, in any order; a single column may have any name.
-    dt : float
-        Length of a step of the system. Times are rounded to the nearest steps.
-    t0 : float
-        Time of step 0.
+    dt : float, optional
+        Length of a step of the system, if times are to be rounded to the nearest steps. By default
+        they are left as they are, which takes a system with an integrator.
+    t0, unit
+        Time of step 0, and the duration of one unit of model time, for dates, see `StateSpace`. By
+        default a record with dates starts at its first row.
 
     Returns
     -------
     dict
-        The arguments ``panel``, ``steps`` and ``observed`` (J, p) of `StateSpace`,
-        `log_likelihood` and `run_filter`, and ``t0``. Records are in the order of their first
-        rows, the rows of each by time.
+        The arguments ``panel``, ``steps`` or ``times``, and ``observed`` (J, p) of `StateSpace`,
+        `log_likelihood` and `run_filter`, and ``t0`` and ``unit``. Records are in the order of
+        their first rows, the rows of each by time.
 
     Raises
     ------
@@ -86,32 +89,52 @@ def panel_from(
     if (numbers < 0).any():
         row = frame.index[int(np.argmax(numbers < 0))]
         raise ModelError(f"every row of frame must have a record, got none in row {row!r}")
-    times, observed = _floats(frame, [time])[:, 0], _floats(frame, columns)
-    order = np.lexsort([times, numbers])
+    observed, has_dates = _floats(frame, columns), are_dates(frame[time])
+    times = frame[time] if has_dates else pd.Series(_floats(frame, [time])[:, 0])
+    order = np.lexsort([times.to_numpy(), numbers])
     labels, data = np.asarray(frame[record])[order], observed[order]
+    named = data if len(columns) == 1 else pd.DataFrame(data, columns=columns)
     records = records_of(labels)
-    steps = [
-        _steps(frame, order[rows], times[order[rows]], label, dt, t0)
+    parts = [
+        _times(frame, order[rows], times.iloc[order[rows]], label)
         for label, rows in zip(records.labels, records.slices(), strict=True)
+    ]
+    if dt is None:
+        at = times.iloc[order]
+        when = {"times": pd.DatetimeIndex(at) if has_dates else at.to_numpy()}
+        return {"panel": labels, **when, "observed": named, "t0": t0, "unit": unit}
+    steps = [
+        _steps(frame, order[rows], own, label, dt, t0, unit)
+        for label, rows, own in zip(records.labels, records.slices(), parts, strict=True)
     ]
     return {
         "panel": labels,
         "steps": np.concatenate(steps),
-        "observed": data if len(columns) == 1 else pd.DataFrame(data, columns=columns),
-        "t0": t0,
+        "observed": named,
+        "t0": 0.0 if are_dates(t0) else t0,
     }
 
 
-def _steps(
-    frame: pd.DataFrame, rows: np.ndarray, times: np.ndarray, label: Any, dt: float, t0: float
-) -> np.ndarray:
-    if np.isnan(times).any():
-        row = frame.index[rows[int(np.argmax(np.isnan(times)))]]
+def _times(frame: pd.DataFrame, rows: np.ndarray, times: pd.Series, label: Any) -> pd.Series:
+    if times.isna().any():
+        row = frame.index[rows[int(np.argmax(times.isna()))]]
         raise ModelError(
             f"record {label!r} of frame must have a time in every row, got none in row {row!r}"
         )
+    return times
+
+
+def _steps(
+    frame: pd.DataFrame,
+    rows: np.ndarray,
+    times: pd.Series,
+    label: Any,
+    dt: float,
+    t0: Any,
+    unit: Any,
+) -> np.ndarray:
     try:
-        return nearest_steps(times, dt, t0=t0)
+        return nearest_steps(times, dt, t0=t0, unit=unit)
     except ModelError as error:
         first = shortened([frame.index[row] for row in rows])
         raise ModelError(f"record {label!r}, rows {first} of frame: {error}") from None

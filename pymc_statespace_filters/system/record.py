@@ -12,57 +12,114 @@ from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
-from .accumulators import n_input_rows, with_resets, with_symbolic_resets
-from .checks import check_finite, check_floats, shortened
+from .checks import check_floats, shortened
+from .clock import Clock, times_of_data
+from .input_columns import n_input_rows, with_columns, with_symbolic_columns
 from .labels import columns_in_order
 from .model import StateSpaceModel
-from .steps import steps_of
+from .placement import Earlier, Timing, place
+from .time_axis import TimeAxis
 
 
 class CheckedRecord(NamedTuple):
-    """A record of numbers: steps (J,), data (J, p), inputs (rows, n_input_columns) and t0 ()."""
+    """A record of numbers: data (J, p) and inputs (rows, n_input_columns), on an axis of time.
 
-    steps: np.ndarray
+    ``system`` is the one that takes the steps of this axis.
+    """
+
+    system: StateSpaceModel
+    clock: Clock
+    axis: TimeAxis
     observed: np.ndarray
     inputs: np.ndarray
-    t0: np.ndarray
+
+    @property
+    def arguments(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Steps, data, inputs and t0, as a likelihood takes them."""
+        return self.axis.steps, self.observed, self.inputs, np.asarray(self.axis.t0)
+
+    def times(self, steps: Any) -> np.ndarray:
+        """The user's times of steps."""
+        return self.clock.shown(self.axis.times(steps))
 
 
 def checked_record(
-    system: StateSpaceModel, observed: Any, *, steps: Any, times: Any, inputs: Any, t0: Any
+    system: StateSpaceModel,
+    observed: Any,
+    *,
+    steps: Any = None,
+    times: Any = None,
+    inputs: Any = None,
+    t0: Any = 0.0,
+    unit: Any = None,
+    input_times: Any = None,
+    inputs_at: Any = "hold",
+    earlier: Earlier | None = None,
 ) -> CheckedRecord:
-    """Check every part of a record of numbers."""
-    t0 = check_finite("t0", t0)
-    at = steps_of(steps, times, system.dt, t0)
-    data = check_observed(observed, system, at.size)
-    return CheckedRecord(at, data, check_inputs(inputs, system, at), np.asarray(t0))
+    """Check every part of a record of numbers; ``observed`` is None for a simulation."""
+    if steps is None and times is None:
+        times = times_of_data(observed)
+    timing = _timing(steps, times, t0, unit, inputs, input_times, inputs_at)
+    placed = place(system, timing._replace(earlier=earlier))
+    (axis,), (rows,) = placed.axes, placed.inputs
+    if observed is None:
+        data = np.full((axis.steps.size, system.p), np.nan)
+    else:
+        data = check_observed(observed, system, axis.steps.size)
+    rows = check_inputs(rows, placed.system, axis)
+    return CheckedRecord(placed.system, placed.clock, axis, data, rows)
+
+
+def _timing(
+    steps: Any, times: Any, t0: Any, unit: Any, inputs: Any, input_times: Any, inputs_at: Any
+) -> Timing:
+    """The timing of a single record."""
+    if isinstance(times, Variable):
+        raise ModelError("times must be numbers, got a symbol; give steps=pm.Data(...) instead")
+    if input_times is not None and isinstance(inputs, Variable):
+        raise ModelError("inputs must be numbers where input_times are given, got a symbol")
+    at, own = ([value] if value is not None else None for value in (times, input_times))
+    return Timing(None if steps is None else [steps], at, t0, unit, [inputs], own, inputs_at)
 
 
 class SymbolicRecord(NamedTuple):
-    """A record of numbers or symbols, with the current numbers of its steps."""
+    """A record of numbers or symbols, with the current numbers of its steps on its axis."""
 
+    system: StateSpaceModel
+    clock: Clock
+    axis: TimeAxis
     steps: Any
-    current_steps: np.ndarray
     observed: Any
     inputs: Any
-    t0: float
 
 
 def symbolic_record(
-    system: StateSpaceModel, observed: Any, *, steps: Any, times: Any, inputs: Any, t0: Any
+    system: StateSpaceModel,
+    observed: Any,
+    *,
+    steps: Any,
+    times: Any,
+    inputs: Any,
+    t0: Any,
+    unit: Any,
+    input_times: Any,
+    inputs_at: Any,
 ) -> SymbolicRecord:
     """Check every part of a record as far as it is known: numbers and the values of shared data."""
-    t0 = check_finite("t0", t0)
-    if isinstance(times, Variable):
-        raise ModelError("times must be numbers, got a symbol; give steps=pm.Data(...) instead")
+    if steps is None and times is None:
+        times = times_of_data(observed)
     is_symbolic = isinstance(steps, Variable)
-    current = steps_of(steps.eval() if is_symbolic else steps, times, system.dt, t0)
+    current = steps.eval() if is_symbolic else steps
+    placed = place(system, _timing(current, times, t0, unit, inputs, input_times, inputs_at))
+    (axis,), (rows,) = placed.axes, placed.inputs
+    steps = steps if is_symbolic else axis.steps
     return SymbolicRecord(
-        steps if is_symbolic else current,
-        current,
-        None if observed is None else _symbolic_observed(observed, system, current),
-        _symbolic_inputs(inputs, system, steps if is_symbolic else current, current),
-        t0,
+        placed.system,
+        placed.clock,
+        axis,
+        steps,
+        None if observed is None else _symbolic_observed(observed, system, axis.steps),
+        _symbolic_inputs(rows, placed.system, steps, axis),
     )
 
 
@@ -80,23 +137,21 @@ def _symbolic_observed(observed: Any, system: StateSpaceModel, steps: np.ndarray
     return observed
 
 
-def _symbolic_inputs(
-    inputs: Any, system: StateSpaceModel, steps: Any, current_steps: np.ndarray
-) -> Any:
+def _symbolic_inputs(inputs: Any, system: StateSpaceModel, steps: Any, axis: TimeAxis) -> Any:
     if isinstance(inputs, Variable):
-        inputs = _symbolic_inputs_of_user(inputs, system, current_steps)
+        inputs = _symbolic_inputs_of_user(inputs, system, axis)
     elif isinstance(steps, Variable):
-        inputs = _check_inputs_of_user(inputs, system, current_steps)
+        inputs = _check_inputs_of_user(inputs, system, axis)
     else:
-        return check_inputs(inputs, system, steps)
-    return with_symbolic_resets(system, inputs, steps) if system.accumulators else inputs
+        return check_inputs(inputs, system, axis)
+    return with_symbolic_columns(system, inputs, steps, axis)
 
 
 def _symbolic_inputs_of_user(
-    inputs: Any, system: StateSpaceModel, steps: np.ndarray
+    inputs: Any, system: StateSpaceModel, axis: TimeAxis
 ) -> TensorVariable:
     if isinstance(inputs, SharedVariable):
-        _check_inputs_of_user(inputs.get_value(), system, steps)
+        _check_inputs_of_user(inputs.get_value(), system, axis)
     if inputs.type.ndim == 1 and system.n_inputs == 1:
         inputs = inputs[:, None]
     if not system.n_inputs or inputs.type.ndim != 2:
@@ -132,12 +187,12 @@ def check_observed(observed: Any, system: StateSpaceModel, n_observations: int) 
     return array
 
 
-def check_inputs(inputs: Any, system: StateSpaceModel, steps: np.ndarray) -> np.ndarray:
+def check_inputs(inputs: Any, system: StateSpaceModel, axis: TimeAxis) -> np.ndarray:
     """The inputs as (rows, n_input_columns); row k holds during step k."""
-    return with_resets(system, _check_inputs_of_user(inputs, system, steps), steps)
+    return with_columns(system, _check_inputs_of_user(inputs, system, axis), axis)
 
 
-def _check_inputs_of_user(inputs: Any, system: StateSpaceModel, steps: np.ndarray) -> np.ndarray:
+def _check_inputs_of_user(inputs: Any, system: StateSpaceModel, axis: TimeAxis) -> np.ndarray:
     if inputs is None:
         if system.n_inputs:
             raise ModelError(
@@ -156,12 +211,18 @@ def _check_inputs_of_user(inputs: Any, system: StateSpaceModel, steps: np.ndarra
         array = array[:, None]
     if array.ndim != 2 or array.shape[1] != system.n_inputs:
         raise inputs_of_other_shape(system, np.shape(inputs))
-    needed = n_input_rows(system, steps)
+    needed = n_input_rows(system, axis.steps)
+    if axis.starts is not None and len(array) not in (needed, axis.starts.size):
+        raise ModelError(
+            f"inputs must have times of their own (input_times=) where times are off the grid of "
+            f"steps, or a row for each of the {axis.starts.size - 1} steps between them, got "
+            f"{len(array)} rows"
+        )
     if array.shape[0] < needed:
         last_row = ", and the observation uses u" if system.observation_uses_inputs else ""
         raise ModelError(
             f"inputs must have at least {needed} rows, because the last observation is at step "
-            f"{steps[-1]} (row k holds during step k{last_row}), got {array.shape[0]}"
+            f"{axis.steps[-1]} (row k holds during step k{last_row}), got {array.shape[0]}"
         )
     return array
 

@@ -1,11 +1,12 @@
-"""The steps of a record: integers, or times on the grid of steps."""
+"""The steps of a record: integers, and times rounded to the grid of steps."""
 
 from typing import Any
 
 import numpy as np
 
 from ..errors import ModelError
-from .checks import check_finite, check_floats, check_positive, is_integer, shortened
+from .checks import check_positive, is_integer, shortened
+from .clock import clock_and_start
 
 # Times must lie on the grid of steps to this fraction of a step.
 GRID_TOLERANCE = 1e-6
@@ -16,36 +17,22 @@ MOST_STEPS = 10**9
 ROWS_AT = ("observations", "steps")
 
 
-def steps_of(steps: Any, times: Any, dt: float, t0: float) -> np.ndarray:
-    """The step numbers of a record, given as steps or as times on the grid ``t0 + k * dt``."""
-    if (steps is None) == (times is None):
-        raise ModelError("give exactly one of steps and times")
-    if steps is not None:
-        return check_steps(steps)
-    array = _numbers_of_time(times)
-    exact = (array - t0) / dt
-    whole = _checked_whole(np.round(exact))
-    off = np.abs(exact - whole)
-    if (off > GRID_TOLERANCE).any():
-        at = int(np.argmax(off))
-        raise ModelError(
-            f"times[{at}] = {array[at]:.15g} is off the grid t0 + k*dt with t0 = {t0:g} and "
-            f"dt = {dt:g} by {off[at]:.3g} steps; round with psf.nearest_steps(times, dt, t0=t0)"
-        )
-    return check_steps(whole.astype("int64"))
-
-
-def nearest_steps(times: Any, dt: float, *, t0: float = 0.0) -> np.ndarray:
+def nearest_steps(times: Any, dt: float, *, t0: Any = 0.0, unit: Any = None) -> np.ndarray:
     """Round real timestamps to the nearest steps of the grid ``t0 + k * dt``.
+
+    A system with an integrator takes times as they are; one whose transition is a function takes
+    whole steps.
 
     Parameters
     ----------
     times : array_like, shape (J,)
-        Timestamps, increasing.
+        Timestamps, increasing, numbers or dates.
     dt : float
         Length of a step.
-    t0 : float
-        Time of step 0.
+    t0 : float or date
+        Time of step 0; of dates, if it is a number, the first one is at ``t0``.
+    unit : str or pandas.Timedelta, optional
+        The duration of one unit of ``dt``, for dates; see `StateSpace`.
 
     Returns
     -------
@@ -62,13 +49,15 @@ def nearest_steps(times: Any, dt: float, *, t0: float = 0.0) -> np.ndarray:
     >>> psf.nearest_steps([0.0, 0.101, 0.199], dt=0.01)
     array([ 0, 10, 20])
     """
-    array = _numbers_of_time(times)
-    dt, t0 = check_positive("dt", dt), check_finite("t0", t0)
+    dt = check_positive("dt", dt)
+    clock, t0 = clock_and_start([times], t0, unit)
+    array = clock.numbers("times", times)
     steps = _checked_whole(np.round((array - t0) / dt))
     if (clashes := np.flatnonzero(np.diff(steps) == 0)).size:
-        first, second = array[clashes[0]], array[clashes[0] + 1]
+        pair = clock.shown(array[clashes[0] :][:2])
+        first, second = (f"{time:g}" if clock.unit is None else time for time in pair)
         raise ModelError(
-            f"times must fall on different steps of dt = {dt:g}, got {first:g} and {second:g}: "
+            f"times must fall on different steps of dt = {dt:g}, got {first} and {second}: "
             "take a smaller dt, or merge the two observations"
         )
     return check_steps(steps.astype("int64"))
@@ -80,7 +69,7 @@ def check_steps(steps: Any) -> np.ndarray:
     if array.size == 0:
         raise ModelError(f"steps must hold at least one step, got {shortened(steps)}")
     if array.ndim == 1 and _holds_large_integers(array):
-        raise _too_many_steps(float(max(array.tolist())))
+        raise too_many_steps(float(max(array.tolist())))
     if array.dtype.kind not in "iu" or array.ndim != 1:
         raise ModelError(
             "steps must be a vector of integers (convert whole floats with .astype(int), give real "
@@ -108,24 +97,10 @@ def rows_at(at: str, steps: np.ndarray) -> np.ndarray:
     return steps if at == "observations" else np.arange(steps[-1] + 1)
 
 
-def _numbers_of_time(times: Any) -> np.ndarray:
-    """Times as floats; dates are refused, because their unit is not that of ``dt``."""
-    array = np.asarray(times)
-    is_text = array.dtype.kind in "SUO" and any(isinstance(t, str | bytes) for t in array.flat)
-    if is_text or array.dtype.kind in "mM":
-        what = "text: read dates with pd.to_datetime, then" if is_text else "dates or durations:"
-        raise ModelError(
-            f"times must be numbers in the unit of dt, got {what} write "
-            "(times - times[0]) / np.timedelta64(1, 's') if dt is in seconds, and round them with "
-            f"psf.nearest_steps; got {shortened(times)}"
-        )
-    return check_floats("times", times, 1)
-
-
 def _checked_whole(steps: np.ndarray) -> np.ndarray:
     """Numbers of steps, still floats, refused if there are too many."""
     if (np.abs(steps) > MOST_STEPS).any():
-        raise _too_many_steps(float(np.abs(steps).max()))
+        raise too_many_steps(float(np.abs(steps).max()))
     return steps
 
 
@@ -136,7 +111,8 @@ def _holds_large_integers(array: np.ndarray) -> bool:
     return array.dtype.kind in "iuO" and bool((array > MOST_STEPS).any())
 
 
-def _too_many_steps(number: float) -> ModelError:
+def too_many_steps(number: float) -> ModelError:
+    """The error for a record with so many steps."""
     return ModelError(
         f"steps must be at most {MOST_STEPS:.0e}, each of which is computed, got {number:g}: take "
         "a larger dt, or a t0 close to the first time"

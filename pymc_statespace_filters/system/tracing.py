@@ -6,7 +6,7 @@ immutable graphs of what they return.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pytensor.tensor as pt
@@ -15,7 +15,6 @@ from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
-from .accumulators import reset
 from .checks import check_positive
 from .equations import (
     Equation,
@@ -26,6 +25,7 @@ from .equations import (
     trace_covariance,
 )
 from .graph_digest import freeze
+from .input_columns import InputRow, input_row, reset
 from .integrators.protocol import Integrator
 from .observation import (
     DensityObservation,
@@ -38,6 +38,8 @@ from .signature import Signature, parameter_symbols, size_of
 from .start import Start, check_start, read_initial_mean, trace_start
 
 Values = Mapping[str, TensorVariable]
+
+INPUT_ROW = 3  # of the inputs theta, x, q, u, t, e and d of a traced function
 
 
 @dataclass(frozen=True)
@@ -62,17 +64,23 @@ class Functions:
         found = [other for other in others if isinstance(other, Equation)]
         return [*self.transition.equations, *self.observation.equations, *found]
 
+    def at_length(self, length: TensorVariable) -> "Functions":
+        """The same with steps of this length, a symbol."""
+        return replace(self, transition=self.transition.at_length(length))  # type: ignore[union-attr]
+
 
 @dataclass(frozen=True)
 class Symbols:
     """The symbols that the functions are called with: all parameters in one vector, and by name.
 
-    ``input_row`` is a row of inputs with the column of resets; ``values["u"]`` is without it.
+    ``input_row`` is a row of inputs with all columns; ``values["u"]`` are the user's. ``time`` is
+    that of a step on a grid; ``values["t"]`` is the one that the functions see.
     """
 
     theta: TensorVariable
     values: Values
-    input_row: TensorVariable
+    input_row: InputRow
+    time: TensorVariable
     drawn: Drawn | None
     start: Start
 
@@ -136,19 +144,27 @@ def read(
     )
 
 
-def size(functions: Functions, signature: Signature, has_accumulators: bool = False) -> Symbols:
+def size(
+    functions: Functions,
+    signature: Signature,
+    *,
+    has_accumulators: bool = False,
+    at_any_times: bool = False,
+) -> Symbols:
     """Make the symbols, parameters first: the lengths of the others depend on them."""
     n_theta = sum(map(size_of, signature.shapes))
     theta = pt.tensor("theta", shape=(n_theta,), dtype="float64")
     values = parameter_symbols(theta, signature.parameters, signature.shapes)
     start = trace_start(functions.initial_mean, functions.initial_dist, values, theta)
     n = start.mean.type.shape[0]
-    n_inputs = len(signature.inputs)
-    u = pt.tensor("u", shape=(n_inputs + has_accumulators,), dtype="float64")
+    row = input_row(
+        len(signature.inputs), at_any_times=at_any_times, has_accumulators=has_accumulators
+    )
+    time = pt.tensor("t", shape=(), dtype="float64")
     values |= {
         "x": pt.tensor("x", shape=(n,), dtype="float64"),
-        "u": u[:n_inputs] if has_accumulators else u,
-        "t": pt.tensor("t", shape=(), dtype="float64"),
+        "u": row.of_user,
+        "t": time if row.time is None else row.time,
     }
     drawn = None
     if functions.process_dist is not None:
@@ -156,7 +172,7 @@ def size(functions: Functions, signature: Signature, has_accumulators: bool = Fa
         noise = drawn.normals
     else:
         noise = pt.tensor("q", shape=(_noise_size(functions, values),), dtype="float64")
-    return Symbols(theta, values | {"q": noise}, u, drawn, start)
+    return Symbols(theta, values | {"q": noise}, row, time, drawn, start)
 
 
 def trace(
@@ -170,6 +186,8 @@ def trace(
     A step begins from the state in which the accumulators, given by their indices, are reset.
     """
     values, n, m = symbols.values, symbols.n, symbols.m
+    if symbols.input_row.length is not None:
+        functions = functions.at_length(symbols.input_row.length)
     n_observables = None if observables is None else len(observables)
     seen = functions.observation.trace(values, n_observables)
     process_noise = _trace_process_noise(functions, values, m)
@@ -177,13 +195,13 @@ def trace(
     initial_cov = start.cov
     if functions.initial_dist is None:
         initial_cov = trace_covariance("initial_cov", functions.initial_cov, n, values)
-    x, q, t = (values[name] for name in "xqt")
-    inputs = [theta, x, q, symbols.input_row, t, seen.noise, seen.datum]
+    x, q, u = values["x"], values["q"], symbols.input_row.whole
+    inputs = [theta, x, q, u, symbols.time, seen.noise, seen.datum]
 
     def frozen(role: str, output: TensorVariable | None) -> FrozenFunctionGraph | None:
         return None if output is None else freeze(inputs, [output], role)
 
-    begin = reset(x, symbols.input_row, accumulators)
+    begin = reset(x, u, accumulators)
     transition, gaussian_transition = (
         freeze(inputs, graph_replace([step], {x: begin}, strict=False), "transition")
         for step in _steps(functions, symbols)

@@ -18,6 +18,7 @@ from pymc_statespace_filters.filters.recommendation import alternatives
 from pymc_statespace_filters.filters.signatures import POINTS
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.pymc_model.random_variable import NUMBERS
 from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable, gaussian_predictions
 
 STEPS = np.array([0, 3, 4, 9])
@@ -273,7 +274,7 @@ def test_predictions_have_the_noise_of_the_sensor_alone():
     theta = theta_of()
     record = {"steps": STEPS, "observed": OBSERVED, "inputs": FORCE, "t0": T0, "seed": 0}
     constants = {name: pt.constant(value) for name, value in record.items()}
-    others = {"name": "d", "dims": ("d_time", "observable"), "score_from": 0}
+    others = {"name": "d", "dims": ("d_time", "observable"), "score_from": 0, "clock": NUMBERS}
     variable = StateSpaceVariable(
         system=KNOWN, filter=psf.EKF(), theta=pt.dvector(), **constants, **others
     )

@@ -17,9 +17,7 @@ PARAMETERS = double_well_parameters(PRECISE_DOUBLE_WELL)
 
 
 def term_health(filter, observed, steps, seed=0):
-    record = checked_record(
-        DOUBLE_WELL_SYSTEM, observed, steps=steps, times=None, inputs=None, t0=0.0
-    )
+    record = checked_record(DOUBLE_WELL_SYSTEM, observed, steps=steps).arguments
     theta = flat_parameters(DOUBLE_WELL_SYSTEM, PARAMETERS)
     return evaluator(TermHealth(DOUBLE_WELL_SYSTEM, filter))(theta, *record, np.asarray(seed))
 

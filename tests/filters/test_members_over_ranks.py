@@ -317,10 +317,8 @@ def test_counts_are_the_same_on_one_and_several_ranks():
         accumulators=["left"],
     )
     filter_, steps = BootstrapPF(200, resample_below=1), np.array([2, 4, 6])
-    record = checked_record(
-        system, [60.0, 55.0, 70.0], steps=steps, times=None, inputs=None, t0=0.0
-    )
-    arguments = np.array([0.1]), record.steps, record.observed, record.inputs, 0.0, 5
+    record = checked_record(system, [60.0, 55.0, 70.0], steps=steps)
+    arguments = np.array([0.1]), *record.arguments, 5
     terms = by_evaluators(system, filter_, arguments)
     alone = psf.log_likelihood(system, filter_, {"rate": 0.1}, record.observed, steps=steps, seed=5)
     assert np.isfinite(alone).all()

@@ -210,7 +210,7 @@ WRONG = [
     (dict(steps=[]), "steps must hold at least one step, got"),
     (dict(steps=[9, 8]), "steps must increase strictly"),
     (dict(steps=[7.5]), "steps must be a vector of integers"),
-    (dict(times=[T0]), "steps must be after the last observation, at step 6, got 0"),
+    (dict(times=[T0]), r"times must be after the last observation, at 13.0, got 10.0"),
     (dict(times=[13.6]), r"times\[0\] = .*13.6.* is off the grid t0 \+ k\*dt with t0 = 10"),
     (dict(n_steps=2), "the model's inputs end after 7 rows, and step 8 needs 9"),
     (dict(n_steps=2, inputs=FORCE), "inputs must have at least 9 rows.* step 8 .*got 7"),

@@ -11,7 +11,11 @@ from pytensor.tensor.variable import TensorVariable
 from ...errors import ModelError
 from ..equations import Equation, as_matrix, as_vector, read_equation
 from ..linear_step import linear_step
+from .step_series import root_of_covariance, step_matrices
 from .substeps import Values
+
+# Of a step whose length is a symbol: exact to rounding up to a rate of 128 per step.
+N_TERMS, DOUBLINGS = 12, 8
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,9 @@ class ExactLinear:
     Notes
     -----
     Series give the matrices of a short fraction of a step, and doublings those of the step, without
-    cancellation: ``A`` and ``B B^T`` may be singular, and the equation may be stiff.
+    cancellation: ``A`` and ``B B^T`` may be singular, and the equation may be stiff. A record at
+    any times has steps of many lengths, whose matrices are computed at each step: that is meant for
+    a few states, and exact to rounding up to rates of 128 per step.
 
     References
     ----------
@@ -114,13 +120,42 @@ class ExactLinear:
         (equation,) = (e for e in self.equations if e.role == name)
         return equation(values)
 
+    def at_length(self, length: TensorVariable) -> "ExactLinearOfLength":
+        """The same equation with steps of this length, a symbol."""
+        return ExactLinearOfLength(self, length)
+
     def _matrices(self, values: Values) -> tuple[TensorVariable, TensorVariable, TensorVariable]:
         """Transition matrix, covariance and offset of a step."""
+        return linear_step(*self.linear_equation(values), self.dt)
+
+    def linear_equation(
+        self, values: Values
+    ) -> tuple[TensorVariable, TensorVariable, TensorVariable]:
+        """A (n, n), B B^T (n, n) and the offset (n,)."""
         n = values["x"].type.shape[0]
         a = as_matrix("A", self._function("A", values), n, n)
         b = as_matrix("B", self._function("B", values), n)
         offset = np.zeros(n) if self.offset is None else self._function("offset", values)
-        return linear_step(a, b @ b.T, as_vector("offset", offset, n), self.dt)
+        return a, b @ b.T, as_vector("offset", offset, n)
+
+
+@dataclass(frozen=True)
+class ExactLinearOfLength:
+    """Steps of an `ExactLinear` of a length that is a symbol, by standard normals."""
+
+    integrator: ExactLinear
+    length: Any
+
+    def step(self, values: Values) -> TensorVariable:
+        """The state one step later."""
+        a, spread, offset = self.integrator.linear_equation(values)
+        phi, moved, cov = step_matrices(
+            a, offset, spread, self.length, n_terms=N_TERMS, doublings=DOUBLINGS
+        )
+        assert cov is not None
+        drifted = phi @ values["x"]
+        drifted = drifted if self.integrator.offset is None else drifted + moved
+        return drifted + root_of_covariance(cov) @ values["q"]
 
 
 def _constant(name: str, value: Any) -> Any:

@@ -10,11 +10,11 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
+from .step_series import root_of_covariance, step_matrices
 from .substeps import SubstepIntegrator, Values, check_additive
 
 N_TERMS = 9  # of the series for a 1/64 of a step
 DOUBLINGS = 6
-SMALLEST_PIVOT = 1e-13  # relative to the variance; below it is rounding of zero
 
 
 @dataclass(frozen=True)
@@ -73,18 +73,15 @@ class LocalLinearization(SubstepIntegrator):
 
     def advance(self, now: Values, noise: TensorVariable, length: float) -> TensorVariable:
         """The state after a substep."""
-        x, drift, short = now["x"], self._drift(now), length / 2**DOUBLINGS
-        jacobian = _jacobian(drift, x)
-        phi, moved = _series(short * jacobian, short * drift)
-        cov = None
+        x, drift = now["x"], self._drift(now)
+        spread = None
         if self.diffusion is not None:
             diffusion = self._diffusion(now)
-            cov = _spread(short * jacobian, short * (diffusion @ diffusion.T))
-        for i in range(DOUBLINGS):
-            moved = moved + phi @ moved
-            cov = None if cov is None else cov + phi @ cov @ phi.T
-            phi = phi @ phi if i < DOUBLINGS - 1 else phi
-        return x + moved if cov is None else x + moved + _root(cov) @ noise
+            spread = diffusion @ diffusion.T
+        _, moved, cov = step_matrices(
+            _jacobian(drift, x), drift, spread, length, n_terms=N_TERMS, doublings=DOUBLINGS
+        )
+        return x + moved if cov is None else x + moved + root_of_covariance(cov) @ noise
 
     def is_stable_at(self, eigenvalues: NDArray[np.complex128]) -> NDArray[np.bool_]:
         """Whether the eigenvalues are finite: the step of a tangent is exact."""
@@ -98,40 +95,3 @@ def _jacobian(drift: TensorVariable, x: TensorVariable) -> TensorVariable:
         for i in range(n)
     ]
     return pt.specify_shape(pt.stack(rows), (n, n))
-
-
-def _series(a: TensorVariable, b: TensorVariable) -> tuple[TensorVariable, TensorVariable]:
-    """exp(a), and the integral of exp(a s) b over a unit of time."""
-    n = a.type.shape[0]
-    power, moved = pt.eye(n), b
-    for m in range(N_TERMS, 0, -1):
-        power = pt.eye(n) + (a @ power) / m
-        moved = b + (a @ moved) / (m + 1)
-    return power, moved
-
-
-def _spread(a: TensorVariable, cov: TensorVariable) -> TensorVariable:
-    """The integral of exp(a s) cov exp(a' s) over a unit of time."""
-    term = total = cov
-    for m in range(1, N_TERMS):
-        half = a @ term
-        term = (half + half.T) / (m + 1)
-        total = total + term
-    return total
-
-
-def _root(cov: TensorVariable) -> TensorVariable:
-    """The lower root of a covariance; a column without spread is zero, and so is its derivative."""
-    n = cov.type.shape[0]
-    root: list[list[Any]] = [[0.0] * n for _ in range(n)]
-    for j in range(n):
-        pivot = cov[j, j] - sum(root[j][k] ** 2 for k in range(j))
-        has_spread = pivot > SMALLEST_PIVOT * cov[j, j]
-        sd = pt.sqrt(pt.switch(has_spread, pivot, 1.0))
-        root[j][j] = pt.switch(has_spread, sd, 0.0)
-        for i in range(j + 1, n):
-            rest = cov[i, j] - sum(root[i][k] * root[j][k] for k in range(j))
-            root[i][j] = pt.switch(has_spread, rest / sd, 0.0)
-    return pt.stack(
-        [pt.stack([pt.as_tensor(entry, dtype="float64") for entry in row]) for row in root]
-    )

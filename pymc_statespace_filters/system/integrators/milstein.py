@@ -15,7 +15,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from ...errors import ModelError
 from .euler_maruyama import EulerMaruyama
-from .substeps import SubstepIntegrator, Values, check_needed
+from .substeps import SubstepIntegrator, Values, check_needed, root_of
 
 N_TRIALS = 6
 
@@ -85,7 +85,7 @@ class Milstein(SubstepIntegrator):
     def advance(self, now: Values, noise: TensorVariable, length: float) -> TensorVariable:
         """The state after a substep."""
         x, diffusion = now["x"], self._diffusion(now)
-        moved = x + length * self._drift(now) + (np.sqrt(length) * diffusion) @ noise
+        moved = x + length * self._drift(now) + (root_of(length) * diffusion) @ noise
         if x not in ancestors([diffusion]):
             return moved
         for j in range(diffusion.type.shape[1]):

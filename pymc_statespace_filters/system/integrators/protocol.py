@@ -23,6 +23,8 @@ class Integrator(Protocol):
       are not standard normals.
     * ``linear_in_noise()``: an integrator with the same ``q``, linear in it, for filters of means
       and covariances, where a step is not.
+    * ``at_length(length)``: an object whose ``step`` is as that of the integrator, of a length that
+      is a symbol and at most ``dt``, for records at any times.
     * ``examined_step()``: another integrator of one substep, whose eigenvalues `is_stable_at` reads
       where those of ``substep().step`` do not tell.
     """

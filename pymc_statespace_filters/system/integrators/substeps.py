@@ -10,6 +10,7 @@ from typing import Any, Self
 import numpy as np
 import pytensor.tensor as pt
 from numpy.typing import NDArray
+from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
@@ -97,6 +98,10 @@ class SubstepIntegrator:
         """One step of the same kind, of length ``dt / substeps``."""
         return self._replace(dt=self.dt / self.substeps, substeps=1)
 
+    def at_length(self, length: TensorVariable) -> Self:
+        """The same integrator with steps of this length, a symbol."""
+        return self._replace(dt=length)
+
     def refined(self) -> Self:
         """The same integrator with twice as many substeps."""
         return self._replace(substeps=2 * self.substeps)
@@ -118,7 +123,12 @@ class SubstepIntegrator:
 
     def _shock(self, now: Values, noise: TensorVariable, length: float) -> TensorVariable:
         """The noise sqrt(h) G q of a substep."""
-        return (np.sqrt(length) * self._diffusion(now)) @ noise
+        return (root_of(length) * self._diffusion(now)) @ noise
+
+
+def root_of(length: Any) -> Any:
+    """The square root of a length, a number or a symbol."""
+    return pt.sqrt(length) if isinstance(length, Variable) else np.sqrt(length)
 
 
 def check_needed(diffusion: Any, integrator: str) -> None:
@@ -156,6 +166,10 @@ class CoupledNoise:
     def bound_to(self, states: Sequence[str] | None) -> "CoupledNoise":
         """The same with indices in place of names of states."""
         return replace(self, integrator=bound_to_states(self.integrator, states))
+
+    def at_length(self, length: TensorVariable) -> "CoupledNoise":
+        """The same with steps of this length, a symbol."""
+        return replace(self, integrator=self.integrator.at_length(length))  # type: ignore[attr-defined]
 
     def linear_in_noise(self) -> "CoupledNoise":
         """The same with the integrator that is linear in its noise, if there is another one."""

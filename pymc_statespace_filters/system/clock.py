@@ -1,0 +1,156 @@
+"""The user's times as numbers of the model, and back: numbers as they are, or dates."""
+
+import datetime
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from ..errors import ModelError
+from .checks import check_finite, check_floats, shortened
+
+
+@dataclass(frozen=True)
+class Clock:
+    """What model times of the records of a variable mean to its user.
+
+    Without a ``unit`` they are the user's numbers. With one, it is the duration of one unit of
+    model time in nanoseconds, and ``origins`` are the dates at model time 0 of each record, or one
+    for all, in nanoseconds since 1970.
+    """
+
+    unit: int | None = None
+    origins: tuple[int, ...] = ()
+
+    def shown(self, times: Any, record: int = 0) -> Any:
+        """The user's times: numbers, or dates (datetime64, UTC), rounded to 1e-9 of a unit."""
+        times = np.asarray(times, dtype=np.float64)
+        if self.unit is None:
+            return times[()]
+        # Microseconds hold all years; they are exact where they are far below a unit.
+        quantum = 1 if self.unit < 10**6 else 1000
+        origin = self.origins[record if len(self.origins) > 1 else 0]
+        moved = np.round(times * (self.unit / quantum)).astype("int64")
+        kind = "ns" if quantum == 1 else "us"
+        return (origin // quantum + moved).astype(f"datetime64[{kind}]")[()]
+
+    def numbers(self, name: str, times: Any, record: int = 0) -> np.ndarray:
+        """Model times from the user's."""
+        if not are_dates(times):
+            if self.unit is not None:
+                raise ModelError(
+                    f"{name} must be dates, as those of the model are, got {shortened(times)}"
+                )
+            return numbers_of_time(name, times)
+        if self.unit is None:
+            raise ModelError(
+                f"{name} must be numbers in the unit of dt, as those of the model are, got dates: "
+                f"{shortened(times)}"
+            )
+        origin = self.origins[record if len(self.origins) > 1 else 0]
+        return _since(origin, _nanoseconds(name, times), self.unit)
+
+
+def clock_and_start(
+    times: Sequence[Any] | None, t0: Any, unit: Any, name: str = "times"
+) -> tuple[Clock, float]:
+    """The clock of some records, given the times of each or None, and the model time of step 0."""
+    if times is None or not are_dates(times[0]):
+        if unit is not None:
+            raise ModelError(
+                f"unit must be None where {name} are not dates, got {unit!r}: numbers are in the "
+                "unit of dt"
+            )
+        if are_dates(t0):
+            raise ModelError(f"t0 must be a number where {name} are numbers, got {t0!r}")
+        return Clock(), check_finite("t0", t0)
+    if unit is None:
+        raise ModelError(
+            f"unit must be the duration of one unit of model time where {name} are dates, such as "
+            'unit="D" where dt and rates count days, got None'
+        )
+    length = unit_of(unit)
+    if are_dates(t0):
+        return Clock(length, (int(_nanoseconds("t0", [t0])[0]),)), 0.0
+    start = check_finite("t0", t0)
+    moved = round(start * length)
+    firsts = [int(_nanoseconds(name, own)[0]) - moved for own in times]
+    return Clock(length, tuple(firsts)), start
+
+
+def unit_of(unit: Any) -> int:
+    """A duration in nanoseconds: a unit of pandas ("D", "h", "s"), or a Timedelta."""
+    try:
+        found = pd.Timedelta(1, unit=unit) if isinstance(unit, str) else pd.Timedelta(unit)
+        length = found.as_unit("ns").value
+    except (TypeError, ValueError, OverflowError):
+        length = 0
+    if isinstance(unit, bool | int | float) or length <= 0:
+        raise ModelError(
+            'unit must be a duration: "D", "h", "min", "s", "ms", "us" or a pandas.Timedelta '
+            f"(a year is pd.Timedelta(days=365.25)), got {unit!r}"
+        )
+    return int(length)
+
+
+def are_dates(times: Any) -> bool:
+    """Whether times are dates and not numbers."""
+    if isinstance(times, datetime.date | np.datetime64):
+        return True
+    dtype = getattr(times, "dtype", None)
+    if isinstance(dtype, pd.DatetimeTZDtype) or getattr(dtype, "kind", "") == "M":
+        return True
+    if isinstance(times, list | tuple) or getattr(dtype, "kind", "") == "O":
+        first = next(iter(np.ravel(np.asarray(times, dtype=object))), None)
+        return isinstance(first, datetime.date | np.datetime64)
+    return False
+
+
+def times_of_data(observed: Any) -> Any:
+    """The dates in the index of a table or in the first dimension of a DataArray; None if none."""
+    index = getattr(observed, "index", None)
+    if isinstance(index, pd.DatetimeIndex):
+        return index
+    dims, coords = getattr(observed, "dims", ()), getattr(observed, "coords", {})
+    if dims and dims[0] in coords and are_dates(coords[dims[0]]):
+        return coords[dims[0]].values
+    return None
+
+
+def numbers_of_time(name: str, times: Any) -> np.ndarray:
+    """Times as floats; text and durations are refused."""
+    array = np.asarray(times)
+    is_text = array.dtype.kind in "SUO" and any(isinstance(t, str | bytes) for t in array.flat)
+    if is_text:
+        raise ModelError(
+            f"{name} must be numbers in the unit of dt or dates, got text: read dates with "
+            f"pd.to_datetime; got {shortened(times)}"
+        )
+    if array.dtype.kind == "m":
+        raise ModelError(
+            f"{name} must be numbers in the unit of dt or dates, got durations: write "
+            f"{name} / np.timedelta64(1, 's') if dt is in seconds; got {shortened(times)}"
+        )
+    return check_floats(name, times, 1)
+
+
+def _since(origin: int, dates: np.ndarray, unit: int) -> np.ndarray:
+    moved = dates - origin
+    # Numbers so small that they are exact as floats.
+    common = np.gcd(np.gcd.reduce(moved), unit)
+    return (moved // common) / (unit // common)
+
+
+def _nanoseconds(name: str, dates: Any) -> np.ndarray:
+    """Dates as nanoseconds since 1970; with a time zone, in UTC."""
+    try:
+        index = pd.DatetimeIndex(np.asarray(dates) if hasattr(dates, "dims") else dates)
+        index = index if index.tz is None else index.tz_convert("UTC").tz_localize(None)
+        array = index.as_unit("ns").asi8
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ModelError(f"{name} must be dates from 1678 to 2261, got {error}") from None
+    if (missing := np.flatnonzero(index.isna())).size:
+        raise ModelError(f"{name} must hold a date in every row, got none in row {missing[0]}")
+    return np.asarray(array)

@@ -1,0 +1,156 @@
+"""Columns of inputs that a system has beside those of its user.
+
+A row of inputs holds what is true during one step. The user gives the first columns. Behind them
+are, in this order,
+
+* of a system at any times, whose steps are not those of a grid, the step's length and the time at
+  which it begins;
+* of a system with accumulators a one where an observation begins the step, at which they are set to
+  zero, and a zero elsewhere.
+
+So filters, simulations and forecasts treat lengths, times and accumulators as they treat inputs.
+Here these columns are made, read and hidden from the user.
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import pytensor.tensor as pt
+from pytensor.graph.basic import Variable
+from pytensor.tensor.variable import TensorVariable
+
+from .time_axis import TimeAxis
+
+if TYPE_CHECKING:
+    from .model import StateSpaceModel
+
+
+class InputRow(NamedTuple):
+    """A row of inputs as a symbol: whole, the user's part, and the length and time of the step.
+
+    The latter are None for a system on a grid.
+    """
+
+    whole: TensorVariable
+    of_user: TensorVariable
+    length: TensorVariable | None
+    time: TensorVariable | None
+
+
+def input_row(n_inputs: int, *, at_any_times: bool, has_accumulators: bool) -> InputRow:
+    """The symbol of a row."""
+    n_columns = n_inputs + 2 * at_any_times + has_accumulators
+    u = pt.tensor("u", shape=(n_columns,), dtype="float64")
+    of_user = u[:n_inputs] if n_columns > n_inputs else u
+    if not at_any_times:
+        return InputRow(u, of_user, None, None)
+    return InputRow(u, of_user, u[n_inputs], u[n_inputs + 1])
+
+
+def reset(
+    x: TensorVariable, input_row: TensorVariable, accumulators: Sequence[int]
+) -> TensorVariable:
+    """The state from which a step begins, for the indices of the accumulators."""
+    for i in accumulators:
+        # A product, because a switch would count as an equation with a kink.
+        x = pt.set_subtensor(x[i], (1.0 - input_row[-1]) * x[i])
+    return x
+
+
+def with_columns(system: "StateSpaceModel", inputs: np.ndarray, axis: TimeAxis) -> np.ndarray:
+    """The user's inputs (..., rows, n_inputs) with all columns, of a record on this axis."""
+    columns = []
+    if axis.lengths is not None and axis.starts is not None:
+        columns += [axis.lengths, axis.starts]
+    if system.accumulators:
+        n_rows = inputs.shape[-2] if system.n_inputs else n_input_rows(system, axis.steps)
+        n_rows = n_rows if axis.starts is None else axis.starts.size
+        at_observation = np.zeros(n_rows)
+        at_observation[axis.steps[axis.steps < n_rows]] = 1.0
+        columns.append(at_observation)
+    if not columns:
+        return inputs
+    own = np.stack(columns, axis=-1)
+    own = np.broadcast_to(own, (*inputs.shape[:-2], *own.shape))
+    if not system.n_inputs:
+        return own.copy()
+    return np.concatenate([_one_row_each(inputs, own.shape[-2]), own], axis=-1)
+
+
+def _one_row_each(inputs: np.ndarray, n_rows: int) -> np.ndarray:
+    """Inputs (..., rows, n_inputs) of so many rows; the last row is repeated once if it lacks."""
+    if inputs.shape[-2] == n_rows - 1:
+        return np.concatenate([inputs, inputs[..., -1:, :]], axis=-2)
+    return inputs
+
+
+def with_symbolic_columns(
+    system: "StateSpaceModel", inputs: Any, steps: Any, axis: TimeAxis
+) -> TensorVariable:
+    """The same for symbols or numbers, inputs (rows, n_inputs) and steps (J,)."""
+    columns = []
+    if axis.lengths is not None and axis.starts is not None:
+        columns += [pt.as_tensor(axis.lengths), pt.as_tensor(axis.starts)]
+        n_rows: Any = axis.starts.size
+    elif system.n_inputs:
+        n_rows = pt.as_tensor(inputs).shape[0]
+    else:
+        n_rows = pt.max(pt.concatenate([pt.as_tensor(steps), [0]]))
+    if system.accumulators:
+        steps = pt.as_tensor(steps)
+        # Steps past the last row fall on one row more, which is cut off.
+        ones = pt.set_subtensor(pt.zeros(n_rows + 1)[pt.clip(steps, 0, n_rows)], 1.0)
+        columns.append(ones[:-1])
+    if not columns:
+        return inputs
+    own = pt.stack(columns, axis=1)
+    if not system.n_inputs:
+        return own
+    rows = pt.as_tensor(inputs)
+    if axis.starts is not None:  # its last row may be missing
+        rows = pt.concatenate([rows, rows[-1:]])[:n_rows]
+    return pt.concatenate([rows, own], axis=1)
+
+
+def without_resets(system: "StateSpaceModel", rows: np.ndarray) -> np.ndarray:
+    """Rows of a system's inputs (..., n_input_columns) at which no accumulator is set to zero."""
+    rows = rows.copy()
+    if system.accumulators:
+        rows[..., -1] = 0.0
+    return rows
+
+
+def inputs_of_user(system: "StateSpaceModel", rows: np.ndarray) -> np.ndarray:
+    """The columns (..., n_inputs) that the user gave."""
+    return rows[..., : system.n_inputs]
+
+
+def times_of_steps(system: "StateSpaceModel", inputs: Any, steps: Any, t0: Any) -> Any:
+    """The times at which steps begin, from the inputs (rows, n_input_columns) of a record."""
+    if system.is_at_any_times:
+        return inputs[..., system.n_inputs + 1][steps]
+    return t0 + steps * system.dt
+
+
+def divided(system: "StateSpaceModel", rows: Any, factor: int) -> Any:
+    """Rows (rows, n_input_columns) for a system whose steps are shorter by an integer factor."""
+    xp = pt if isinstance(rows, Variable) else np
+    repeated = xp.repeat(rows, factor, axis=-2)
+    number = xp.arange(repeated.shape[-2]) % factor
+    columns = [repeated[..., i] for i in range(system.n_input_columns)]
+    if system.is_at_any_times:
+        i = system.n_inputs
+        columns[i] = columns[i] / factor
+        columns[i + 1] = columns[i + 1] + number * columns[i]
+    if system.accumulators:  # a step, not each of its parts, begins with a reset
+        columns[-1] = columns[-1] * xp.eq(number, 0) if xp is pt else columns[-1] * (number == 0)
+    return xp.stack(columns, axis=-1) if columns else repeated
+
+
+def n_input_rows(system: "StateSpaceModel", steps: np.ndarray) -> int:
+    """Number of rows of inputs that a record needs.
+
+    One per step, and one more if the observation has the argument u.
+    """
+    return int(steps[-1]) + int(system.observation_uses_inputs) if steps.size else 0

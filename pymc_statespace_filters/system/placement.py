@@ -1,0 +1,173 @@
+"""Where the observations and inputs of records lie: from what a user gives to steps and rows."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..errors import ModelError
+from .clock import Clock, clock_and_start
+from .model import StateSpaceModel
+from .steps import GRID_TOLERANCE, check_steps
+from .time_axis import (
+    TimeAxis,
+    TimesBetween,
+    axis_of,
+    check_increasing,
+    divided_axis,
+    is_grid,
+    off_grid,
+)
+from .timed_inputs import check_inputs_at, timed_inputs
+
+
+class Earlier(NamedTuple):
+    """Where some records go on from: their clock and t0, and the last step of each so far.
+
+    ``ends`` are the times of these steps, of records at any times; None on a grid.
+    """
+
+    clock: Clock
+    t0: float
+    steps: list[int]
+    ends: list[float] | None
+
+    def axis(self, given: TimesBetween, dt: float, record: int) -> TimeAxis:
+        """The axis of a record at any times; its earlier steps, which are over, have no length."""
+        assert self.ends is not None
+        end, k = self.ends[record], self.steps[record]
+        if given.times[0] <= end:
+            raise ModelError(
+                f"times must come after the last row of the earlier run, which is at "
+                f"{self.clock.shown([end], record)[0]}, got "
+                f"{self.clock.shown(given.times[:1], record)[0]}"
+            )
+        own = divided_axis(given.times, t0=end, dt=dt, breaks=given.breaks)
+        assert own.starts is not None
+        assert own.lengths is not None
+        starts = np.concatenate([np.full(k, end), own.starts])
+        lengths = np.concatenate([np.zeros(k), own.lengths])
+        return TimeAxis(own.steps + k, self.t0, dt, starts, lengths)
+
+
+class Timing(NamedTuple):
+    """What a user says of the times of some records; of a list, an entry for each record.
+
+    ``steps`` or ``times`` is None; ``input_times`` is None for inputs by step.
+    """
+
+    steps: list[Any] | None
+    times: list[Any] | None
+    t0: Any
+    unit: Any
+    inputs: list[Any]
+    input_times: list[Any] | None
+    inputs_at: Any
+    earlier: Earlier | None = None
+
+
+class Placement(NamedTuple):
+    """The axis of each record, and its inputs by step, as the user gave them or from their times.
+
+    ``system`` is the one at any times where an axis is not a grid.
+    """
+
+    system: StateSpaceModel
+    clock: Clock
+    axes: list[TimeAxis]
+    inputs: list[Any]
+
+
+def _one_by_one(check: Callable[..., Any], *parts: Sequence[Any]) -> list[Any]:
+    return [check(*own) for own in zip(*parts, strict=True)]
+
+
+def place(
+    system: StateSpaceModel, timing: Timing, check_each: Callable[..., list[Any]] = _one_by_one
+) -> Placement:
+    """Find the steps of some records; ``check_each`` calls a check for each, see `Records`."""
+    check_inputs_at(timing.inputs_at)
+    if (timing.steps is None) == (timing.times is None):
+        raise ModelError("give exactly one of steps and times")
+    if timing.earlier is None or timing.earlier.clock.unit is None:
+        clock, t0 = clock_and_start(timing.times, timing.t0, timing.unit)
+    else:
+        clock, t0 = timing.earlier.clock, timing.earlier.t0
+    return place_by(clock, t0, system, timing, range(len(timing.inputs)), check_each)
+
+
+def place_by(
+    clock: Clock,
+    t0: float,
+    system: StateSpaceModel,
+    timing: Timing,
+    numbers: Sequence[int],
+    check_each: Callable[..., list[Any]] = _one_by_one,
+) -> Placement:
+    """The same by a clock that is known, for the records of these numbers."""
+    timed = None
+    if timing.input_times is not None:
+        timed = check_each(
+            lambda g, inputs, times: timed_inputs(
+                inputs, times, timing.inputs_at, system.n_inputs, clock, g
+            ),
+            numbers, timing.inputs, timing.input_times,
+        )  # fmt: skip
+    changes = [np.empty(0)] * len(numbers) if timed is None else [one.changes() for one in timed]
+    if timing.steps is not None:
+        steps = check_each(check_steps, timing.steps)
+        given = [
+            TimesBetween(own, t0 + own * system.dt, t0, breaks)
+            for own, breaks in zip(steps, changes, strict=True)
+        ]
+    else:
+        assert timing.times is not None
+        times = check_each(lambda g, own: _increasing(own, clock, g), numbers, timing.times)
+        given = [
+            TimesBetween(None, own, t0, breaks) for own, breaks in zip(times, changes, strict=True)
+        ]
+    given = [_until_the_end(one) for one in given]
+    if not is_grid(given, system.dt):
+        check_each(lambda g, one: check_takes(system, one, clock, g), numbers, given)
+        system = system.at_any_times
+    earlier, is_on_grid = timing.earlier, not system.is_at_any_times
+    if earlier is not None and not is_on_grid:
+        axes = check_each(lambda g, one: earlier.axis(one, system.dt, g), numbers, given)
+    else:
+        axes = check_each(lambda one: axis_of(one, system.dt, on_grid=is_on_grid), given)
+    if timed is None:
+        return Placement(system, clock, axes, timing.inputs)
+    rows = check_each(lambda g, one, axis: one.rows(axis, clock, g), numbers, timed, axes)
+    return Placement(system, clock, axes, rows)
+
+
+def _increasing(given: Any, clock: Clock, record: int) -> np.ndarray:
+    times = clock.numbers("times", given, record)
+    if times.size == 0:
+        raise ModelError("times must hold at least one time, got none")
+    check_increasing("times", times, lambda time: clock.shown(time, record))
+    return times
+
+
+def _until_the_end(given: TimesBetween) -> TimesBetween:
+    """The same without changes of the inputs before step 0 or after the last observation."""
+    inside = (given.breaks > given.t0) & (given.breaks < given.times[-1])
+    return given._replace(breaks=given.breaks[inside])
+
+
+def check_takes(system: StateSpaceModel, given: TimesBetween, clock: Clock, record: int) -> None:
+    """Raise if a step of the system has one length, and a time is off the grid."""
+    if system.why_one_length is None:
+        return
+    for name, times in (("times", given.times), ("input_times", given.breaks)):
+        off = off_grid(times, given.t0, system.dt)
+        if (off > GRID_TOLERANCE).any():
+            at = int(np.argmax(off))
+            value = clock.shown(times, record)[at]
+            number = f"{value:.15g}" if clock.unit is None else str(value)
+            what = f"times[{at}] =" if name == "times" else "the change of the inputs at"
+            raise ModelError(
+                f"{what} {number} is off the grid t0 + k*dt with t0 = {given.t0:g} and dt = "
+                f"{system.dt:g} by {off[at]:.3g} steps, and {system.why_one_length}; round with "
+                "psf.nearest_steps(times, dt, t0=t0)"
+            )
