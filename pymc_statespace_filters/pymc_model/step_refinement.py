@@ -203,7 +203,9 @@ def path_eigenvalues(
     if inputs.shape[1] == 0:  # a system without inputs
         inputs = np.zeros((len(theta), 1, system.n_input_columns))
     n_steps = min(int(steps.max(initial=0)) * substeps, MAX_STEPS)
-    rows = without_resets(system, inputs[:, : n_steps // substeps + 1])
+    # The last row of a record at any times begins no step.
+    n_rows = max(n_steps // substeps + (not system.is_at_any_times), 1)
+    rows = without_resets(system, inputs[:, :n_rows])
     inputs = divided(system, rows, substeps)
     x = start(theta)
     eigenvalues = []

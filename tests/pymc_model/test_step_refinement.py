@@ -10,10 +10,12 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.pymc_model.step_refinement import (
+    densities_by_halvings,
     densities_by_steps,
     path_eigenvalues,
     step_stability,
 )
+from pymc_statespace_filters.system.record import checked_record
 
 OBSERVED = {"observation": lambda x: [x[0]], "observation_noise": [[0.1]]}
 
@@ -160,3 +162,40 @@ def test_a_panel_is_stable_where_each_record_is():
     ]
     assert [one.all() for one in alone] == [False, False]
     np.testing.assert_array_equal(found, np.all(alone, axis=0))
+
+
+TIMES = np.array([0.03, 0.21, 0.3, 0.47])
+
+
+@pytest.mark.parametrize("substeps", [1, 2])
+def test_steps_of_a_record_at_any_times_have_their_own_lengths(substeps):
+    record = checked_record(
+        euler(lambda x, t, a: [a * t * x[0]], substeps=substeps), np.zeros(4), times=TIMES
+    )
+    found = eigenvalues(record.system, [[-2.0]], int(record.axis.steps[-1]), record.inputs)
+    starts, lengths = (part[:-1] for part in record.axis.rows())
+    last = starts + lengths * (substeps - 1) / substeps  # where the last substep begins
+    slopes = 1 - 2.0 * last * lengths / substeps
+    assert found.real.min() == pytest.approx(slopes.min(), rel=1e-12)
+
+
+@pytest.mark.parametrize("filter", [psf.EKF(), psf.GridFilter()])
+def test_halved_steps_of_a_record_at_any_times(filter):
+    def model(substeps, filter=filter):
+        system = euler(lambda x, a: [-a * x[0]], substeps=substeps)
+        with pm.Model() as built:
+            pm.Normal("a")
+            psf.StateSpace("d", system, filter, times=TIMES, observed=[0.9, 0.8, np.nan, 1.1])
+        return built
+
+    coarse = model(1)
+    found = [
+        pytensor.function(coarse.value_vars, one, mode="FAST_COMPILE")(1.3)
+        for one in densities_by_halvings(coarse, 1)
+    ]
+    at = {"a": 1.3}
+    assert found[0] == pytest.approx(coarse.compile_logp()(at), abs=1e-12)
+    # The exact filters of a linear system; a GridFilter takes shorter steps instead of substeps.
+    exact = model(2, psf.EKF()).compile_logp()(at)
+    assert found[1] == pytest.approx(exact, abs=1e-12 if filter == psf.EKF() else 1e-8)
+    assert abs(found[1] - found[0]) > 1e-4

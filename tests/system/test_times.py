@@ -6,6 +6,7 @@ import pytest
 import xarray as xr
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.clock import clock_and_start
 from pymc_statespace_filters.system.record import checked_record
 from pymc_statespace_filters.system.time_axis import divided_axis
@@ -77,7 +78,7 @@ def test_a_record_on_the_grid_has_the_system_and_the_arrays_of_its_steps():
     ],
 )
 def test_times_that_are_refused(times, message):
-    with pytest.raises(psf.ModelError, match=message):
+    with pytest.raises(ModelError, match=message):
         psf.log_likelihood(EXACT, psf.EKF(), THETA, [0.0] * len(times), times=times)
 
 
@@ -103,7 +104,7 @@ def test_a_function_has_whole_steps_and_an_integrator_of_one_length_is_named():
     cases = [(by_function, "a transition that is a function"), ({"transition": Fixed()}, "Fixed")]
     for transition, name in cases:
         system = psf.StateSpaceModel(**transition, **SETTINGS)
-        with pytest.raises(psf.ModelError, match=rf"times\[0\] = 0.3 is off the grid.*{name}"):
+        with pytest.raises(ModelError, match=rf"times\[0\] = 0.3 is off the grid.*{name}"):
             psf.log_likelihood(system, psf.EKF(), {}, [0.0], times=[0.3])
 
 
@@ -205,7 +206,7 @@ def test_linear_inputs_are_those_of_the_middle_of_a_step():
     ],
 )
 def test_inputs_that_are_refused(inputs, input_times, settings, message):
-    with pytest.raises(psf.ModelError, match=message):
+    with pytest.raises(ModelError, match=message):
         total(inputs, input_times, **settings)
 
 
@@ -286,7 +287,7 @@ def test_records_of_a_panel_start_at_their_own_first_dates():
     ],
 )
 def test_dates_that_are_refused(settings, message):
-    with pytest.raises(psf.ModelError, match=message):
+    with pytest.raises(ModelError, match=message):
         checked_record(EXACT, DATA, **settings)
 
 
