@@ -167,9 +167,9 @@ def _timed_inputs(
     if input_times is None:
         return [(None, np.empty(0))] * len(records)
     labels = [record.label for record in records]
-    n_inputs, clock = variable.system.n_inputs, variable.clock
+    names, clock = variable.system.inputs, variable.clock
     found = [
-        timed_inputs(own, times, inputs_at, n_inputs, clock, record.number)
+        timed_inputs(own, times, inputs_at, names, clock, record.number)
         for own, times, record in zip(
             of_each_record("inputs", inputs, labels),
             of_each_record("input_times", input_times, labels),

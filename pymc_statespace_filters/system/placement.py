@@ -109,7 +109,7 @@ def place_by(
     if timing.input_times is not None:
         timed = check_each(
             lambda g, inputs, times: timed_inputs(
-                inputs, times, timing.inputs_at, system.n_inputs, clock, g
+                inputs, times, timing.inputs_at, system.inputs, clock, g
             ),
             numbers, timing.inputs, timing.input_times,
         )  # fmt: skip

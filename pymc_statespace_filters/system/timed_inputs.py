@@ -1,5 +1,6 @@
 """Inputs with times of their own, as rows of inputs for the steps of a record."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from ..errors import ModelError
 from .checks import check_floats
 from .clock import Clock
+from .labels import columns_in_order
 from .steps import GRID_TOLERANCE
 from .time_axis import TimeAxis, check_increasing
 
@@ -50,19 +52,24 @@ class TimedInputs(NamedTuple):
 
 
 def timed_inputs(
-    inputs: Any, input_times: Any, inputs_at: Any, n_inputs: int, clock: Clock, record: int = 0
+    inputs: Any,
+    input_times: Any,
+    inputs_at: Any,
+    names: Sequence[str],
+    clock: Clock,
+    record: int = 0,
 ) -> TimedInputs:
-    """Check inputs with times of their own."""
+    """Check inputs of these names with times of their own."""
     check_inputs_at(inputs_at)
     times = clock.numbers("input_times", input_times, record)
     check_increasing("input_times", times, lambda time: clock.shown(time, record))
-    values = check_floats("inputs", inputs, None)
-    if values.ndim == 1 and n_inputs == 1:
+    values = check_floats("inputs", columns_in_order("inputs", inputs, names, "inputs"), None)
+    if values.ndim == 1 and len(names) == 1:
         values = values[:, None]
-    if not n_inputs or values.shape != (times.size, n_inputs):
+    if not names or values.shape != (times.size, len(names)):
         raise ModelError(
-            f"inputs must have shape {(times.size, n_inputs)}, a row for each of input_times and a "
-            f"column for each input of the system, got {np.shape(inputs)}"
+            f"inputs must have shape {(times.size, len(names))}, a row for each of input_times and "
+            f"a column for each input of the system, got {np.shape(inputs)}"
         )
     return TimedInputs(times, values, inputs_at)
 
