@@ -6,7 +6,7 @@ nothing of a filter is compiled again. What is too large, or has no scalar form,
 """
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from threading import Lock
@@ -31,12 +31,18 @@ from ..compiler.codegen.scalarize import NotUnrollableError, evaluate, objects
 from ..compiler.native.compilation import COMPILATION
 from ..compiler.native.composed_call import WORD, Copy, ScalarCall, Sum, status_of, table_of
 from ..compiler.native.entry_point import F64_PTR
+from ..compiler.native.plan import N_RECORD, N_REQUEST, REQUEST, RESULTS
 from ..compiler.native.planned_function import BoundCall, PlannedFunction, refusal
 from ..compiler.native.pytensor_function import Call, NativeFunction
 from ..ops.base import HEALTH_SIZE, FilterOp, kernel
 
 MAX_OPERATIONS = 1000  # an operation takes about a millisecond to compile
 _MAX_ELEMENTS = 2000  # of an array
+# Results of filters that are known here, and the place of one of them.
+_RESULTS, _TAPE = {"terms", "health", "tape", "theta_bar"}, 2
+# Words of a call: the length of the tape that it leaves, and of the one that it is given.
+_LENGTH_LEFT = N_RECORD + N_REQUEST + RESULTS.n_tape
+_LENGTH_GIVEN = N_RECORD + REQUEST.n_tape
 _SCALAR_CODE = {"given": F64_PTR, "out": F64_PTR}
 
 
@@ -65,6 +71,12 @@ class _Terms(NamedTuple):
     runs: tuple[tuple[int, int], ...] | None = None
 
 
+class _Tape(NamedTuple):
+    """What a forward pass has left for the backward pass of the same filter."""
+
+    call: int
+
+
 class _Run(NamedTuple):
     """Rows whose terms are added up; to the last one if there is no ``end``."""
 
@@ -79,6 +91,7 @@ class _Source(NamedTuple):
     input: int | None = None
     constant: np.ndarray | None = None
     computed: np.ndarray | None = None  # of expressions
+    tape_of: int | None = None  # a call
 
 
 @dataclass
@@ -86,7 +99,7 @@ class _Parts:
     """A graph in parts: arguments of filters, sums of their terms, and what is made of these.
 
     Inputs of the expressions are named by what they are: an element of an input of the graph, a sum
-    of terms, or an element of the health of a filter.
+    of terms, or an element of the health of a filter or of its gradient.
     """
 
     inputs: list[Variable]
@@ -147,6 +160,8 @@ class _Parts:
                     self.known.pop(output, None)
             return self.run(inner.inputs, inner.outputs)
         arguments = [self._value(variable) for variable in node.inputs]
+        if any(isinstance(argument, _Tape) for argument in arguments):
+            raise NotUnrollableError(f"a tape in the operation {node.op}")
         if any(isinstance(argument, _Terms) for argument in arguments):
             return [self._of_terms(node.op, arguments)]
         if isinstance(node.op, CheckAndRaise):
@@ -182,13 +197,25 @@ class _Parts:
         with COMPILATION:
             planned = kernel(node.op)
         names = [name for name, _ in node.op.results]
-        if not isinstance(planned, PlannedFunction) or names != ["terms", "health"]:
+        if not isinstance(planned, PlannedFunction) or not set(names) <= _RESULTS:
             raise NotUnrollableError(f"the operation {node.op}")
-        if node.outputs[0].type.ndim != 1:
+        if names[0] == "terms" and node.outputs[0].type.ndim != 1:
             raise NotUnrollableError("terms of many points")
         number = len(self.filters)
         self.filters.append((planned, [self._source(variable) for variable in node.inputs]))
-        return [_Terms(number), self._named(f"health.{number}", (HEALTH_SIZE,))]
+        results = {
+            "terms": lambda: _Terms(number),
+            "health": lambda: self._named(f"health.{number}", (HEALTH_SIZE,)),
+            "tape": lambda: _Tape(number),
+            "theta_bar": lambda: self._named(f"gradient.{number}", self._shape(node.inputs[0])),
+        }
+        return [results[name]() for name in names]
+
+    def _shape(self, parameters: Variable) -> tuple[int, ...]:
+        """The shape of the parameters of a filter, which is that of their gradient."""
+        if parameters in self._places:
+            return self.arrays[self._places[parameters]].shape
+        return np.shape(self._value(parameters))
 
     def _source(self, variable: Variable) -> _Source:
         if variable in self._places:
@@ -196,6 +223,8 @@ class _Parts:
         if isinstance(variable, Constant):
             return _Source(constant=np.require(variable.data, requirements=("C", "A", "W")))
         values = self._value(variable)
+        if isinstance(values, _Tape):
+            return _Source(tape_of=values.call)
         if isinstance(values, _Terms) or variable.type.dtype != "float64":
             raise NotUnrollableError("an argument of a filter that is not made of parameters")
         return _Source(computed=values)
@@ -258,8 +287,8 @@ class WrittenFunction(NativeFunction):
         self._data = [np.array(value, order="C") for value in shared]
         self._parts = parts = _Parts(graph.inputs, [*self.example, *self._data])
         results = parts.run(graph.inputs, graph.outputs)
-        if any(isinstance(result, _Terms) for result in results):
-            raise NotUnrollableError("terms as a result")
+        if any(isinstance(result, _Terms | _Tape) for result in results):
+            raise NotUnrollableError("terms or a tape as a result")
         self.kinds = [
             (result.shape, np.dtype(output.type.dtype))
             for result, output in zip(results, graph.outputs, strict=True)
@@ -311,8 +340,10 @@ class WrittenFunction(NativeFunction):
         calls = self._bound(arrays, computed)
         given = [np.zeros(len(written.used)) for written in (self._before, self._after)]
         places = _Places(arrays, calls, self._parts.sums)
+        lengths = {i: np.array([call.words[_LENGTH_LEFT]]) for i, call in enumerate(calls)}
         copies_before = [
             *places.seeds(self._parts.filters),
+            *places.tape_lengths(self._parts.filters, lengths),
             *places.copies(self._before.used, given[0]),
         ]
         copies_after = places.copies(self._after.used, given[1])
@@ -322,18 +353,25 @@ class WrittenFunction(NativeFunction):
         table = table_of(
             ScalarCall(self._before.code.address, given[0].ctypes.data, computed.ctypes.data),
             ScalarCall(self._after.code.address, given[1].ctypes.data),
-            calls, sums, copies_before, copies_after,
+            calls, sums, copies_before, copies_after, places.tapes(self._parts.filters),
         )  # fmt: skip
-        call, memory = Call(table, np.zeros(1 + self.size)), (arrays, computed, calls, given)
+        call, memory = (
+            Call(table, np.zeros(1 + self.size)),
+            (arrays, computed, calls, given, lengths),
+        )
         return call, lambda _memory=memory: self(*inputs)
 
     def _bound(self, arrays: Sequence[np.ndarray], computed: np.ndarray) -> list[BoundCall]:
         """The calls of the filters, with what is computed for them in parts of one vector."""
-        calls, first = [], 0
+        calls: list[BoundCall] = []
+        first = 0
         for planned, sources in self._parts.filters:
-            arguments = []
+            arguments: list[Any] = []
             for source in sources:
-                if source.computed is None:
+                given: Any
+                if source.tape_of is not None:
+                    given = calls[source.tape_of].results[_TAPE]
+                elif source.computed is None:
                     given = source.constant if source.input is None else arrays[source.input]
                 else:
                     part = computed[first : first + source.computed.size]
@@ -359,6 +397,25 @@ class _Places(NamedTuple):
             if place is not None and source.input is not None
         ]
 
+    def tape_lengths(
+        self, filters: Sequence[tuple[PlannedFunction, list[_Source]]], lengths: Mapping
+    ) -> list[Copy]:
+        """Copies of the lengths of tapes to where a filter overwrites them by what it has used."""
+        taped = {s.tape_of for _, sources in filters for s in sources if s.tape_of is not None}
+        return [Copy(lengths[i].ctypes.data, self._word(i, _LENGTH_LEFT)) for i in sorted(taped)]
+
+    def tapes(self, filters: Sequence[tuple[PlannedFunction, list[_Source]]]) -> dict[int, Copy]:
+        """Before a backward pass, the copy of the length of the tape that was left for it."""
+        return {
+            i: Copy(self._word(source.tape_of, _LENGTH_LEFT), self._word(i, _LENGTH_GIVEN))
+            for i, (_, sources) in enumerate(filters)
+            for source in sources
+            if source.tape_of is not None
+        }
+
+    def _word(self, call: int, word: int) -> int:
+        return int(self.calls[call].words.buffer_info()[0]) + WORD * word
+
     def copies(self, names: Sequence[str], given: np.ndarray) -> list[Copy]:
         """Copies of single numbers to their places in front of the scalar code."""
         found = []
@@ -366,13 +423,15 @@ class _Places(NamedTuple):
             kind, number, *element = name.split(".")
             if kind == "sum":
                 continue
-            array = self.arrays[int(number)] if kind == "input" else self._health(int(number))
+            array = self._array(kind, int(number))
             source = array.ctypes.data + WORD * int(element[0])
             found.append(Copy(source, given.ctypes.data + WORD * i))
         return found
 
-    def _health(self, call: int) -> np.ndarray:
-        return self.calls[call].results[1]
+    def _array(self, kind: str, number: int) -> np.ndarray:
+        if kind == "input":
+            return self.arrays[number]
+        return self.calls[number].results[1 if kind == "health" else 0].reshape(-1)
 
     def sums_into(self, names: Sequence[str], given: np.ndarray) -> list[Sum]:
         """The sums of terms, to their places in front of the scalar code."""

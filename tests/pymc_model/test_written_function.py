@@ -134,3 +134,42 @@ def test_many_operations_are_left_to_numba(size):
     found = native_function(function, example)
     assert not isinstance(found, WrittenFunction)
     assert found(*example)[0] == pytest.approx(np.exp(0.001 * np.arange(size)).sum(), rel=1e-12)
+
+
+def with_gradient(model, **options):
+    """The function of a model's log-density and its gradient by the vector of all variables."""
+    values = [model.rvs_to_values[rv] for rv in model.free_RVs]
+    density = model.logp()
+    gradient = pt.concatenate([pt.flatten(part) for part in pytensor.grad(density, values)])
+    return compile_raveled(model.initial_point(), [density, gradient], values, **options)
+
+
+@pytest.mark.parametrize("panel", [False, True])
+def test_gradients(panel):
+    """Both passes of each filter, also after a forward pass that failed and left no tape."""
+    with pm.Model() as model:
+        pm.LogNormal("spread", 0.0, 1.0)
+        pm.Normal("phi", 0.5, 0.2, shape=2 if panel else ())
+        record = {"steps": [1, 2, 3, 5] * 2, "panel": ["a"] * 4 + ["b"] * 4} if panel else RECORD
+        system = autoregression()
+        for name, more in {"d": {}, **({} if panel else {"e": {"score_from": 2}})}.items():
+            psf.StateSpace(name, system, psf.EKF(), **record | {"observed": DATA} | more)
+    function, start = with_gradient(model)
+    written = native_function(function, [start])
+    assert isinstance(written, WrittenFunction)
+    truth, _ = with_gradient(model, mode="FAST_COMPILE")
+    position = start.copy()
+    bound, _ = written.bind([position])
+    rng = np.random.default_rng(2)
+    for i in range(4):
+        position[:] = start + 0.3 * rng.standard_normal(start.size)
+        if i == 2:
+            position[0] = 800.0  # no covariance
+        expected = truth(position)
+        assert call(bound)
+        if i != 2:
+            np.testing.assert_allclose(bound.out[1], expected[0], rtol=1e-11)
+            np.testing.assert_allclose(bound.out[2:], expected[1], rtol=1e-9, atol=1e-12)
+            np.testing.assert_array_equal(written(position)[1], bound.out[2:])
+        else:
+            assert bound.out[1] == expected[0] == -np.inf

@@ -7,10 +7,11 @@ A table of addresses describes it, so that a new composition compiles its scalar
     sums of terms
     after(given, out)           writes whether a check failed, then the results
 
-In front of each, words are copied to their places: what the scalar code reads, and seeds.
+In front of each, words are copied to their places: what the scalar code reads, seeds, and the
+length of a tape that one filter has left for another.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -74,19 +75,21 @@ def table_of(
     sums: Sequence[Sum],
     copies_before: Sequence[Copy],
     copies_after: Sequence[Copy],
+    copies_between: Mapping[int, Copy] | None = None,
 ) -> np.ndarray:
     """The table of a composition, whose first word is the address of the function to call.
 
     That function takes the table and the vector of results, of which the first is 1 if a check
-    failed or a call was refused.
+    failed or a call was refused. ``copies_between`` are made before the calls with these numbers.
     """
     _RUN.compile()
     words = [_RUN.address, 0, *before, after.function, after.given]
     words += map(len, (copies_before, calls, sums, copies_after))
     for copy in copies_before:
         words += copy
-    for call in calls:
-        words += call.plan, call.words.buffer_info()[0]
+    for i, call in enumerate(calls):
+        copy = (copies_between or {}).get(i, Copy(0, 0))
+        words += call.plan, call.words.buffer_info()[0], *copy
     for each in [*sums, *copies_after]:
         words += each
     return np.array(words, dtype=np.int64)
@@ -137,16 +140,18 @@ def _run(table, out):
     head = carray(table, (_N_HEAD,))
     n_calls, n_sums = head[_HEAD.n_calls], head[_HEAD.n_sums]
     n_copies = head[_HEAD.n_copies_before] + head[_HEAD.n_copies_after]
-    words = carray(table, (_N_HEAD + 2 * n_copies + 2 * n_calls + 3 * n_sums,))
+    words = carray(table, (_N_HEAD + 2 * n_copies + 4 * n_calls + 3 * n_sums,))
     place = _copy_words(words, _N_HEAD, head[_HEAD.n_copies_before])
     call_address(head[_HEAD.before], (head[_HEAD.given_before], head[_HEAD.out_before]))
     for _ in range(n_calls):
+        if words[place + 2] != 0:
+            _copy_words(words, place + 2, 1)
         status = _call_plan(words[place], words[place + 1])
         if status:
             words[_HEAD.status] = status
             carray(out, (1,))[0] = 1.0
             return
-        place += 2
+        place += 4
     for _ in range(n_sums):
         _add_up(words, place)
         place += 3
