@@ -12,16 +12,15 @@ from ..pymc_model.inspection import gradient_obstacle, noisy_filters
 
 DRAM, NUTS = "dram", "nuts"
 
-# Effective draws that the costs are compared for, and what `benchmarks/choice.py` has measured on
-# its posteriors: effective draws per evaluation of a walk in d dimensions times d^2, and per
-# gradient of NUTS; gradients of an iteration of its warm-up; the cost of a gradient in values; and
-# CPU seconds that take compiling it.
+# Effective draws that the costs are compared for. The rest are medians of narrow posteriors of 4 to
+# 22 parameters, with wide scatter (`benchmarks/choice.py` measures both samplers):
 _N_EFFECTIVE = 400
-_WALK_EFFICIENCY = 0.6
-_NUTS_EFFICIENCY = 0.015
-_NUTS_STEPS = 15
-_GRADIENT = 3.0
-_COMPILATION = 7.0
+_WALK_EFFICIENCY = 0.6  # effective draws of a random walk per evaluation, times d^2
+_NUTS_EFFICIENCY = 0.04  # effective draws of NUTS per gradient
+_NUTS_STEPS = 12  # gradients of an iteration of its warm-up
+_GRADIENT = 3.0  # cost of a gradient, in log-densities
+_CALL = 25e-6  # CPU seconds of a step of NUTS beside the gradient
+_COMPILATION = 1.2  # CPU seconds to compile a gradient
 # Evaluations of a search for starts.
 _STARTS = 8000
 # Seconds of a measurement of the cost, and evaluations at most.
@@ -58,7 +57,7 @@ def expected_seconds(sampler: str, dim: int, cost: float, chains: int, tune: int
         efficiency = min(0.1, _WALK_EFFICIENCY / max(dim, 1) ** 2)
         return cost * (_STARTS + chains * tune + _N_EFFECTIVE / efficiency)
     gradients = chains * tune * _NUTS_STEPS + _N_EFFECTIVE / _NUTS_EFFICIENCY
-    return _COMPILATION + cost * (_STARTS + _GRADIENT * gradients)
+    return _COMPILATION + cost * _STARTS + (_GRADIENT * cost + _CALL) * gradients
 
 
 def why_no_nuts(model: Model) -> str:
