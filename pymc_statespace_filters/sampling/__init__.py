@@ -1,9 +1,9 @@
 """Samplers of a model's log-density and noise seeds, independent of its filters."""
 
+from .chosen_sampler import sample
+from .dram_chains import run_models, sample_dram
 from .particle_number.suggest import suggest_particles
 from .run.ranks import Ranks
-from .sample import sample
-from .sample_dram import run_models, sample_dram
 from .starts.find_starts import find_starts
 from .step import DRAM
 from .target.settings import RandomWalkSettings

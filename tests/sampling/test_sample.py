@@ -6,10 +6,10 @@ import pytest
 import xarray as xr
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters import sample
 from pymc_statespace_filters.sampling import choice
 from pymc_statespace_filters.sampling.kernel.state import Draws
 from pymc_statespace_filters.sampling.run.thinned_draws import Thinning, add_iterations, coarsen
-from pymc_statespace_filters.sampling.sample import sample
 from tests.kernels import with_kernel
 from tests.sampling.test_dram import simple_model
 from tests.sampling.test_sample_dram import state_space_model
