@@ -125,7 +125,7 @@ def test_the_end_of_a_run_that_reached_nothing(caplog):
     call = {"model": simple_model(), "tune": 100, **QUIET}
     sample(50, until_ess=ENDLESS, max_draws=100, **call)
     assert "was not reached with 100 iterations" in caplog.text
-    assert "iterations would do" in caplog.text
+    assert "iterations of each chain would do" in caplog.text
     assert "larger max_draws than 100" in caplog.text
 
 
