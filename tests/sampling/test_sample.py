@@ -9,6 +9,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters import sample
 from pymc_statespace_filters.sampling import choice
 from pymc_statespace_filters.sampling.kernel.state import Draws
+from pymc_statespace_filters.sampling.output.convergence import convergence
 from pymc_statespace_filters.sampling.run.thinned_draws import Thinning, add_iterations, coarsen
 from tests.kernels import with_kernel
 from tests.sampling.test_dram import simple_model
@@ -118,6 +119,22 @@ def test_a_doubled_run_resumes_with_the_same_bits(tmp_path, monkeypatch, n_parts
         for group in ("posterior", "sample_stats"):
             xr.testing.assert_equal(found[group].to_dataset(), expected[group].to_dataset())
         assert found.attrs["iterations_per_draw"] == 8
+
+
+def test_a_run_ends_as_soon_as_its_draws_are_worth_enough():
+    """At the first power of two: chains with this k, and with half of it, show it."""
+    call = {"model": simple_model(), "tune": 200, **QUIET}
+    tree = sample(150, until_ess=350, **call)
+    k = tree.attrs["iterations_per_draw"]
+    assert 2 <= k <= 32
+
+    def found(thin):
+        draws = psf.sample_dram(150, thin=thin, **call)["posterior"]
+        values = [draws["mu"].values, np.log(draws["sigma"].values)]
+        return convergence([np.stack(of, axis=1) for of in zip(*values, strict=True)])
+
+    assert found(k).reaches(350)
+    assert not found(k // 2).reaches(350)
 
 
 def test_the_end_of_a_run_that_reached_nothing(caplog):

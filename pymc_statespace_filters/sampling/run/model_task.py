@@ -97,7 +97,7 @@ class ModelTask:
         self.n_iterations = stops_of(request)[0]  # after which the chains end, for now
         self.length = first_length(request)  # after the warm-up
         self._results: dict[int, tuple[Draws, ChainState]] = {}
-        # The last diagnostics, and the lengths of the chains that they are of.
+        # The last diagnostics, and the iterations behind a draw and lengths that they are of.
         self._convergence: tuple[list[int], Convergence | None] = [], None
         self._began = self._ended = 0.0
 
@@ -279,7 +279,7 @@ class ModelTask:
     def convergence(self) -> Convergence | None:
         """Diagnostics of the results; computed once, as it takes long for many draws."""
         positions = self._positions({})
-        lengths = [len(of_chain) for of_chain in positions]
+        lengths = [self.thin, *map(len, positions)]
         if lengths != self._convergence[0]:
             self._convergence = lengths, convergence(positions)
         return self._convergence[1]
