@@ -243,9 +243,22 @@ def test_a_mixture_that_is_never_accepted_keeps_only_its_least_share_while_tunin
     nothing = np.empty((0, 2))
     for tuning, expected in ((True, LEAST_SHARE), (False, 0.0)):
         new = improved_mixture(
-            packed, [record(0.0, 0.6)], 0, 400, rng, population=nothing, tuning=tuning
+            packed, [record(0.0, 0.6)], 0, 400, rng, population=nothing, thin=1, tuning=tuning
         )
         assert new[SHARE] == expected
+
+
+def test_thinned_draws_leave_the_population_its_weight():
+    """Of 200 draws of a chain near 0 the mixture has one in ten, beside 80 points near 50."""
+    rng = np.random.default_rng(12)
+    population = 50.0 + rng.standard_normal((80, 2))
+    chains, rest = [record(1.0, 1.0)], {"population": population, "tuning": True}
+    shares = []
+    for thin in (1, 10):
+        packed = improved_mixture(no_mixture(2), chains, 0, 400, rng, thin=thin, **rest)
+        points = drawn(packed, 2, 4000, 13)
+        shares.append((points[:, 0] > 25.0).mean())
+    assert shares == pytest.approx([80 / 280, 80 / 100], abs=0.15)
 
 
 def test_few_or_constant_draws_give_no_mixture():

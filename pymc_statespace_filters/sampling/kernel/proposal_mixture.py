@@ -57,16 +57,17 @@ def improved_mixture(
     rng: np.random.Generator,
     *,
     population: Array,
+    thin: int,
     tuning: bool,
 ) -> Array:
     """The packed mixture for the iterations from ``end`` on, given the one since ``begin``.
 
-    It is fitted to the population (m, d), which may be empty, and the later half of the draws.
+    It is fitted to the population (m, d), which may be empty, and one of ``thin`` of the later half
+    of the draws.
     """
     share = next_share(packed[SHARE], chains, begin, end)
-    fitted = fitted_mixture(
-        [population, *(draws.positions[end // 2 : end] for draws in chains)], rng
-    )
+    draws = [chain.positions[end // 2 : end][::-thin] for chain in chains]
+    fitted = fitted_mixture([population, *draws], rng)
     new = packed.copy() if fitted is None else fitted
     if new[N_COMPONENTS] > 0:
         new[SHARE] = max(share, LEAST_SHARE) if tuning else share

@@ -15,7 +15,7 @@ from ..kernel.proposal_mixture import fitted_mixture, improved_mixture, warmup_p
 from ..kernel.state import Draws
 from ..starts.annealing import N_SWEEPS
 from ..starts.modes import modes_message, modes_warning
-from ..starts.population import N_POINTS, find_population
+from ..starts.population import MANY_DIMENSIONS, N_POINTS, find_population
 from ..target.target import Target
 from .request import SamplingRequest
 
@@ -32,6 +32,7 @@ _UNUSABLE_PILOT = (
 _LONG_WARMUP, _SHORT_WARMUP = 4000, 800
 _PER_POINT = 40  # of these iterations
 _FEWEST_POINTS = 32
+_THIN = 0.3  # draws for each dimension, of which the mixture is fitted to one
 
 
 def stops_of(request: SamplingRequest) -> list[int]:
@@ -63,8 +64,12 @@ class WarmUp:
 
     def __init__(self, request: SamplingRequest, dim: int, population: np.ndarray | None):
         self._request = request
-        # The sweeps of a search for starts are nearly the same points; a pilot has one.
-        step = N_SWEEPS if request.initvals is None else 1
+        # In many dimensions a chain of a thousand iterations has few independent draws, and the
+        # population has settled. Else the sweeps of a search are nearly the same points; a pilot
+        # has one.
+        is_many = dim >= MANY_DIMENSIONS and population is not None
+        step = 1 if is_many or request.initvals is not None else N_SWEEPS
+        self._thin = round(_THIN * dim) if is_many else 1
         self._population = np.empty((0, dim)) if population is None else population[::step]
         fitted = None
         if population is not None:
@@ -83,6 +88,7 @@ class WarmUp:
                 end,
                 generator_of(self._request, end),
                 population=self._population,
+                thin=self._thin,
                 tuning=end < self._request.tune,
             )
         return min(stop for stop in stops if stop > end)

@@ -35,10 +35,10 @@ from .langevin import settle
 from .modes import Points, find_modes
 
 N_POINTS = 256
+MANY_DIMENSIONS = 9  # in which moves along the gradient are worth its compilation
 _TYPICAL_EVALUATIONS = 36  # for each point, for the progress bar
 _DRAWN = 4  # draws of a reference for each point, at most N_POINTS or what the EKF has found
 _DEPTH, _DEPTH_PER_DIMENSION = 10.0, 3.0  # nats below the highest point, where points are left out
-_MANY_DIMENSIONS = 9  # in which moves along the gradient are worth its compilation
 _PER_DIMENSION = 3  # points, for the metric of these moves
 _TYPICAL_MOVES = 40  # of each point, for the progress bar
 _MOST_BATCHES = 10  # of draws of the prior
@@ -149,7 +149,7 @@ def _settled(
     """
     dim = target.raveled.dim
     last = x[-(len(x) // N_SWEEPS) :]
-    if dim < _MANY_DIMENSIONS or len(last) < _PER_DIMENSION * dim:
+    if dim < MANY_DIMENSIONS or len(last) < _PER_DIMENSION * dim:
         return None
     rows = target.gradient_rows(of_pilot=of_pilot)
     if rows is None:
