@@ -12,6 +12,7 @@ from scipy.special import logsumexp
 
 from ..errors import EvidenceWarning
 from ..importance import MAX_PARETO_K, MIN_EFFECTIVE, mcse_of_chains, pareto_k
+from ..progress import row_progress
 from ..pymc_model.density import RowFunction, check_free_variables
 from ..pymc_model.inspection import given_model
 from ..pymc_model.posterior_draws import MIN_DRAWS, unconstrained_draws
@@ -33,6 +34,7 @@ def step_error(
     halvings: int = 1,
     n_draws: int = 200,
     random_seed: int | np.random.Generator | None = None,
+    progressbar: bool = True,
 ) -> pd.DataFrame:
     r"""How much log-likelihood and log-evidence change if the integration step is halved.
 
@@ -53,6 +55,8 @@ def step_error(
         Number of draws used, evenly from every chain; all if there are fewer.
     random_seed : None, int or numpy.random.Generator
         Of the noise of particle and ensemble filters.
+    progressbar : bool
+        Whether to show a progress bar if it takes longer than two seconds.
 
     Returns
     -------
@@ -129,7 +133,7 @@ def step_error(
     each = min(length, max(1, n_draws // n_chains))
     draws = draws[:, np.linspace(0, length - 1, each).round().astype(int)]
     functions = [RowFunction(model, graph) for graph in densities_by_halvings(model, halvings)]
-    coarse, *finer = _at_draws(functions, draws, rng)
+    coarse, *finer = _at_draws(functions, draws, rng, progressbar)
     rows = [_changes(fine, coarse, draws.shape[:2], jackknife=True) for fine in finer]
     lengths = max(step_lengths(model)) * 0.5 ** np.arange(1, halvings + 1)
     table = pd.DataFrame(rows, index=pd.Index(lengths, name="dt"))
@@ -147,14 +151,21 @@ def step_error(
     return table
 
 
-def _at_draws(functions: list[RowFunction], draws: Array, rng: np.random.Generator) -> list[Array]:
+def _at_draws(
+    functions: list[RowFunction], draws: Array, rng: np.random.Generator, progressbar: bool
+) -> list[Array]:
     """Log-densities (draws, seeds) by each of the functions, with the same seeds for all."""
     x = draws.reshape(-1, draws.shape[-1])
     n_seeds = N_SEEDS if functions[0].seed_names else 1
     x = np.repeat(x, n_seeds, axis=0)
     size = (len(x), len(functions[0].seed_names))
     seeds = rng.integers(np.iinfo(np.int64).max, size=size)
-    return [one.evaluate(x, seeds).reshape(-1, n_seeds) for one in functions]
+    found = []
+    for halvings, one in enumerate(functions):
+        with row_progress(one.calls, enabled=progressbar) as announce:
+            announce(f"step halved {halvings} times" if halvings else "step as it is", len(x))
+            found.append(one.evaluate(x, seeds).reshape(-1, n_seeds))
+    return found
 
 
 def _changes(

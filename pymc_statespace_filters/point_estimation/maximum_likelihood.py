@@ -32,7 +32,10 @@ AT_BOUND = 0.02  # standard deviations of the population: smaller moves end at a
 
 
 def maximum_likelihood(
-    model: Model | None = None, *, random_seed: int | np.random.Generator | None = None
+    model: Model | None = None,
+    *,
+    random_seed: int | np.random.Generator | None = None,
+    progressbar: bool = True,
 ) -> MaximumLikelihoodEstimate:
     r"""Find the parameters of largest likelihood, with standard errors.
 
@@ -46,6 +49,8 @@ def maximum_likelihood(
         Default: the model of the ``with`` block. Its free variables must be continuous, and their
         priors proper.
     random_seed : int or numpy.random.Generator, optional
+    progressbar : bool
+        Whether to show a progress bar of the population if it takes longer than two seconds.
 
     Returns
     -------
@@ -134,7 +139,7 @@ def maximum_likelihood(
         n_evaluations += len(x)
         return factors.evaluate(x, rng)
 
-    x = population_of(model, rng, progressbar=False)[0].x[::N_SWEEPS]
+    x = population_of(model, rng, progressbar=progressbar)[0].x[::N_SWEEPS]
     population = Population(x, *evaluate(x))
     if factors.is_noisy:
         peak = maximize_estimated(lambda x: evaluate(x)[1], population, rng)
