@@ -161,8 +161,8 @@ def test_of_estimates_that_agree_the_most_certain_common_one_is_taken():
     }
     assert list(compare_evidence(rivals)["log_evidence"]) == [-8, -9]
     assert said(rivals)[0] == (
-        "Log-evidences by bridge, the most certain of estimates that agree (chib, bridge, "
-        "importance)."
+        "Log-evidences by bridge, the smallest standard errors of estimates that agree (chib, "
+        "bridge, importance)."
     )
     with_one = rivals | {"c": evidence(-20, estimator="laplace")}
     assert said(with_one)[0].startswith("Log-evidences of 'a', 'b' by bridge, ")

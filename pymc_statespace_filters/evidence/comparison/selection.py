@@ -157,7 +157,7 @@ def _agreeing(found: Mapping[str, ByEstimator]) -> Selection:
         sentence = f"Log-evidences {each}"
     reason = "the only estimates with a standard error"
     if len(estimators) > 1:
-        reason = f"the most certain of estimates that agree ({', '.join(estimators)})"
+        reason = f"the smallest standard errors of estimates that agree ({', '.join(estimators)})"
     return Selection({name: (single | chosen)[name] for name in found}, f"{sentence}, {reason}.")
 
 
