@@ -68,7 +68,6 @@ SYSTEMS = {
     "not symmetric": (dict(initial_cov=[[1.0, 0.5], [0.0, 1.0]]), "initial_cov .*symmetric"),
     "negative": (dict(process_noise=[[-0.1]]), "process_noise .*-0.1.*eigenvalue"),
     "indefinite": (dict(initial_cov=[[1.0, 2.0], [2.0, 1.0]]), "initial_cov .*eigenvalue"),
-    "noiseless": (dict(observation_noise=[[0.0]]), "observation_noise .*positive definite"),
     "not finite": (dict(observation_noise=[[np.nan]]), "observation_noise .*finite"),
     "words": (dict(observation_noise=[["a"]]), "observation_noise .*numbers"),
     "a bare variance": (
