@@ -12,11 +12,15 @@ import numpy as np
 from arviz_stats import mcse
 from arviz_stats.base import array_stats
 from numpy.typing import NDArray
+from scipy.stats import chi2
+from scipy.stats import t as student
 
 MIN_EFFECTIVE = 100  # effective terms below which a standard error is unreliable
 MAX_PARETO_K = 0.7  # above which it is, however many terms there are
 SAME = 1e-9  # nats, between weights that count as equal
 NEGLIGIBLE = 700.0  # nats below the largest weight
+MAX_RHAT = 1.03  # of the terms of a mean; 150 effective terms of four chains reach it by chance
+AGREE = 0.95  # probability that chains of one law count as agreeing about a mean
 
 Array = NDArray[np.float64]
 
@@ -46,10 +50,35 @@ def log_mean(log_terms: Array) -> float:
 def mcse_of_chains(terms: Array) -> float:
     """Standard error of the mean of autocorrelated terms, shape (chain, draw).
 
-    ArviZ's, from Geyer's initial monotone sequence over split chains: it includes the disagreement
-    between chains as well as the autocorrelation within them.
+    ArviZ's, from Geyer's initial monotone sequence over split chains. If the means of the chains
+    scatter more than the autocorrelation within them allows, it is that of their jackknife, which
+    for a mean is their standard deviation over the root of their number, by as much wider as
+    Student's interval of so few chains is wider than the normal one.
     """
-    return float(mcse(terms, method="mean"))
+    pooled, n_chains = float(mcse(terms, method="mean")), len(terms)
+    if n_chains < 2:
+        return pooled
+    between = float(terms.mean(axis=1).std(ddof=1)) / math.sqrt(n_chains)
+    within = math.hypot(*(float(mcse(one[None], method="mean")) for one in terms)) / n_chains
+    if (n_chains - 1) * between**2 <= chi2.ppf(AGREE, n_chains - 1) * within**2:
+        return pooled
+    return max(pooled, between * float(student.ppf(0.975, n_chains - 1)) / 1.96)
+
+
+def disagreement(log_terms: Array) -> str:
+    """Whether chains disagree about the terms (chain, draw) of a mean; empty if they do not.
+
+    R-hat is that of the ranks (Vehtari, Gelman, Simpson, Carpenter and Buerkner 2021), thus of the
+    terms as of their logarithms.
+    """
+    with np.errstate(invalid="ignore"):  # of equal terms it is 0 / 0
+        found = float(array_stats.rhat(log_terms, chain_axis=0, draw_axis=1, method="rank"))
+    if not found > MAX_RHAT:
+        return ""
+    return (
+        f"the chains disagree about the averaged terms (R-hat {found:.2f}, above {MAX_RHAT}): "
+        "draw more"
+    )
 
 
 def mcse_of_walkers(terms: Array) -> float:

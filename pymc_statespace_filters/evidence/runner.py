@@ -1,5 +1,6 @@
 """Run estimators on the draws of a model and turn each `Estimate` into an `Evidence`."""
 
+import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -9,6 +10,7 @@ from zlib import crc32
 import numpy as np
 import pymc as pm
 import xarray as xr
+from numpy.typing import NDArray
 
 from ..errors import EvidenceWarning, ModelError
 from ..filter_checks.checks import stored
@@ -26,6 +28,7 @@ from .evidence import Evidence, store_evidence
 from .exact_density import ExactDensity
 from .posterior import Posterior, build_posterior, data_fingerprint, observation_count
 from .reweighting.correction import exact_posterior
+from .unreached import check_reached
 
 MAXIMUM = "maximum likelihood"
 CORRECTION = "correction of the draws"
@@ -80,7 +83,10 @@ def run_estimators(
             posterior = exact_posterior(posterior, exact, stream(CORRECTION), announce)
         estimates, refusals = _estimates(estimators, posterior, stream, announce)
         announce(MAXIMUM, N_EVALUATIONS)
-        largest = max_log_likelihood(posterior, stream(MAXIMUM)).log_likelihood
+        rng = stream(MAXIMUM)
+        largest = max_log_likelihood(posterior, rng)
+        if exact is None:
+            estimates = _where_reached(estimates, estimators, posterior, largest.point, rng)
 
     _warn(LESS_CERTAIN.format("the log-evidence"), common)
     rest_on_draws = [one.name for one in estimators if one.name in estimates and uses_draws(one)]
@@ -90,7 +96,7 @@ def run_estimators(
     for name, refusal in refusals.items():
         _warn(f"no estimate by {name}", [str(refusal)])
     of_model = _model_fields(model, posterior, support)
-    of_model |= {"max_log_likelihood": largest, "noise": noise}
+    of_model |= {"max_log_likelihood": largest.log_likelihood, "noise": noise}
     of_model["approximate"] = not (exactness(model) if exact is None else exact.is_exact)
     found = {}
     for name, estimate in estimates.items():
@@ -102,6 +108,29 @@ def run_estimators(
         if extend_inferencedata:
             store_evidence(idata, found[name], dict(estimate.settings))
     return found
+
+
+def _where_reached(
+    estimates: dict[str, Estimate],
+    estimators: Sequence[Estimator],
+    posterior: Posterior,
+    peak: NDArray[np.float64],
+    rng: np.random.Generator,
+) -> dict[str, Estimate]:
+    """Estimates without an error, and with a doubt, if their draws never reached the posterior."""
+    from_draws = {one.name for one in estimators if uses_draws(one)} & estimates.keys()
+    if not from_draws:
+        return estimates
+    largest = max(estimates[name].log_evidence for name in from_draws)
+    reason = check_reached(posterior, peak, largest, rng)
+    if not reason:
+        return estimates
+    return estimates | {
+        name: replace(
+            estimates[name], se=math.nan, doubts=(reason, *estimates[name].doubts), shortfall=""
+        )
+        for name in from_draws
+    }
 
 
 def _problems(name: str, estimate: Estimate) -> Iterator[tuple[str, Sequence[str]]]:

@@ -166,9 +166,10 @@ def _tested(name: str, found: ByEstimator) -> ByEstimator:
     choose = f"choose one of {list(found)} by estimator="
     tested = {one: evidence for one, evidence in found.items() if not math.isnan(evidence.se)}
     if not tested:
+        doubts = "; ".join(dict.fromkeys(one.doubts for one in found.values() if one.doubts))
         raise ModelError(
             f"{name!r} has estimates by several estimators, none of them with a standard error, so "
-            f"that their agreement is unknown: {choose}"
+            f"that their agreement is unknown: {choose}{f' ({doubts})' if doubts else ''}"
         )
     agreement = assess_agreement(tested)
     if not agreement:

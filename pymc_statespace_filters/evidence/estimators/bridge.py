@@ -49,7 +49,13 @@ from numpy.typing import NDArray
 from scipy.special import expit, log_expit
 from scipy.stats import Covariance, multivariate_normal
 
-from ...importance import MIN_EFFECTIVE, LogMean, log_mean_of_chains, log_mean_of_independent
+from ...importance import (
+    MIN_EFFECTIVE,
+    LogMean,
+    disagreement,
+    log_mean_of_chains,
+    log_mean_of_independent,
+)
 from ..pooled import bridge_constant
 from ..posterior import Posterior, check_overlap
 from .protocol import Estimate
@@ -131,7 +137,10 @@ class Bridge:
                 "se_proposals": se_proposals,
                 "zero_density": float(np.mean([fold.zero_density for fold in folds])),
             },
-            doubts=tuple(_check(n_effective, se_draws, se_proposals, gap)),
+            doubts=(
+                *_check(n_effective, se_draws, se_proposals, gap),
+                *sorted({fold.disagreement for fold in folds if fold.disagreement})[-1:],
+            ),
             shortfall=shortfall(
                 self.target_se,
                 se_draws,
@@ -207,6 +216,7 @@ class _Fold:
     common: float  # part of the draws' error that is common to both halves
     n_effective: float  # effective number of draws
     zero_density: float  # fraction of the proposals
+    disagreement: str  # of the chains, about the averaged terms
 
 
 def _errors(folds: Sequence[_Fold]) -> tuple[float, float]:
@@ -264,6 +274,7 @@ def _bridge_ratios(at_draws: Array, at_proposals: Array, *, pooled: Array) -> _F
         common=min(moved, draws.error),
         n_effective=n_effective,
         zero_density=float(np.isneginf(at_proposals).mean()),
+        disagreement=disagreement(at_draws),
     )
 
 

@@ -40,7 +40,13 @@ from typing import ClassVar
 import numpy as np
 
 from ...errors import ModelError
-from ...importance import MIN_EFFECTIVE, LogMean, log_mean_of_chains, log_mean_of_independent
+from ...importance import (
+    MIN_EFFECTIVE,
+    LogMean,
+    disagreement,
+    log_mean_of_chains,
+    log_mean_of_independent,
+)
 from ...system.checks import check_count
 from ..posterior import Posterior, check_overlap
 from .block_ordinates import BlockEstimate, estimate_in_blocks
@@ -177,6 +183,7 @@ class OneBlockEstimate:
     denominator: LogMean
     n_proposals: int
     zero_density: float  # fraction of the proposals
+    disagreement: str = ""  # of the chains, about the terms of the numerator
 
     @property
     def se(self) -> float:
@@ -199,9 +206,9 @@ def estimate_in_one_block(
     ``most``.
     """
     # Numerator: the draws, with the log-densities stored by the chain.
-    numerator = log_mean_of_chains(
-        proposal.log_alpha_to_center(posterior.log_density) + proposal.log_q(posterior.draws)
-    )
+    log_terms = proposal.log_alpha_to_center(posterior.log_density)
+    log_terms = log_terms + proposal.log_q(posterior.draws)
+    numerator = log_mean_of_chains(log_terms)
 
     # Denominator: draws from q(x*, .), with fresh log-densities.
     ratio = 0.0 if target_se is None else ratio_of_errors(target_se, numerator.error)
@@ -218,7 +225,13 @@ def estimate_in_one_block(
     log_evidence = proposal.log_density - numerator.value + denominator.value
     zero_density = float(np.isneginf(log_density).mean())
     return OneBlockEstimate(
-        log_evidence, proposal.scale, numerator, denominator, n_proposals, zero_density
+        log_evidence,
+        proposal.scale,
+        numerator,
+        denominator,
+        n_proposals,
+        zero_density,
+        disagreement(log_terms),
     )
 
 
@@ -244,6 +257,7 @@ def _of_one_block(folds: Sequence[OneBlockEstimate]) -> Estimate:
             f"the proposals have an effective number of {denominator:.0f}, fewer than "
             f"{MIN_EFFECTIVE}: raise n_proposals, or reparametrise towards a Gaussian posterior"
         )
+    doubts += sorted({fold.disagreement for fold in folds if fold.disagreement})[-1:]
     settings = {
         "n_blocks": 1,
         "scale": math.sqrt(folds[0].scale * folds[1].scale),
