@@ -12,6 +12,8 @@ import numpy as np
 from arviz_stats import mcse
 from arviz_stats.base import array_stats
 from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.special import log_expit, logsumexp
 from scipy.stats import chi2
 from scipy.stats import t as student
 
@@ -20,7 +22,7 @@ MAX_PARETO_K = 0.7  # above which it is, however many terms there are
 SAME = 1e-9  # nats, between weights that count as equal
 NEGLIGIBLE = 700.0  # nats below the largest weight
 MAX_RHAT = 1.03  # of the terms of a mean; 150 effective terms of four chains reach it by chance
-AGREE = 0.95  # probability that chains of one law count as agreeing about a mean
+AGREE = 0.99  # probability that chains of one law count as agreeing about a mean
 
 Array = NDArray[np.float64]
 
@@ -144,3 +146,26 @@ def systematic(weights: Array, count: int, rng: np.random.Generator) -> NDArray[
     ends = np.cumsum(weights)
     places = (rng.random() + np.arange(count)) * (ends[-1] / count)
     return np.minimum(np.searchsorted(ends, places, side="right"), len(weights) - 1)
+
+
+def bridge_constant(at_draws: Array, at_proposals: Array, log_odds: float) -> float:
+    """The log-evidence Z_a by bridge sampling (Meng and Wong 1996).
+
+    ``at_draws`` and ``at_proposals`` are log-ratios l = ln a - ln q at draws and at proposals of q.
+    The unique solution of ``ln E_q[s(u)] - ln E_draws[s(-u)] = log_odds``, where s is the logistic
+    function and ``u = l - ln Z_a + log_odds``. ``log_odds`` is that of the numbers of draws and
+    proposals; -inf may be among the ratios at the proposals.
+    """
+
+    def excess(log_evidence: float) -> float:
+        shift = log_odds - log_evidence
+        upper = logsumexp(log_expit(at_proposals + shift)) - math.log(at_proposals.size)
+        lower = logsumexp(log_expit(-at_draws - shift)) - math.log(at_draws.size)
+        return float(upper - lower - log_odds)
+
+    # The evidence lies within the ratios, lowered at most by the fraction of possible proposals.
+    possible = at_proposals[~np.isneginf(at_proposals)]
+    log_fraction = math.log(possible.size / at_proposals.size) + float(log_expit(log_odds))
+    least = min(at_draws.min(), possible.min()) + log_fraction - 1
+    most = max(at_draws.max(), possible.max()) + 1
+    return float(brentq(excess, least, most, xtol=1e-9))

@@ -30,34 +30,11 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
-from scipy.special import expit, log_expit, logsumexp
+from scipy.special import expit
 
-from ..importance import LogMean, log_mean, mcse_of_chains, normalised
+from ..importance import LogMean, bridge_constant, log_mean, mcse_of_chains, normalised
 
 Array = NDArray[np.float64]
-
-
-def bridge_constant(at_draws: Array, at_proposals: Array, log_odds: float) -> float:
-    """The log-evidence Z_a from log-ratios l = ln a - ln q at draws and at proposals of q.
-
-    The unique solution of ``ln E_q[s(u)] - ln E_draws[s(-u)] = log_odds``, where s is the logistic
-    function and ``u = l - ln Z_a + log_odds``. ``log_odds`` is that of the numbers of draws and
-    proposals; -inf may be among the ratios at the proposals.
-    """
-
-    def excess(log_evidence: float) -> float:
-        shift = log_odds - log_evidence
-        upper = logsumexp(log_expit(at_proposals + shift)) - math.log(at_proposals.size)
-        lower = logsumexp(log_expit(-at_draws - shift)) - math.log(at_draws.size)
-        return float(upper - lower - log_odds)
-
-    # The evidence lies within the ratios, lowered at most by the fraction of possible proposals.
-    possible = at_proposals[~np.isneginf(at_proposals)]
-    log_fraction = math.log(possible.size / at_proposals.size) + float(log_expit(log_odds))
-    least = min(at_draws.min(), possible.min()) + log_fraction - 1
-    most = max(at_draws.max(), possible.max()) + 1
-    return float(brentq(excess, least, most, xtol=1e-9))
 
 
 @dataclass(frozen=True)

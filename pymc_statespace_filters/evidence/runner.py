@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..errors import EvidenceWarning, ModelError
-from ..filter_checks.checks import stored
+from ..filter_checks.checks import stored as stored_filter_checks
 from ..filter_checks.finding import OFF
 from ..filters.protocol import Filter
 from ..progress import row_progress
@@ -21,6 +21,7 @@ from ..pymc_model.density import ModelDensity
 from ..pymc_model.inspection import exactness, given_model
 from ..pymc_model.posterior_draws import noise_was_moved, posterior_group
 from ..pymc_model.prior import Support
+from ..unvisited.sentences import stored, unvisited
 from .checks import check_convergence, check_discretisation
 from .estimators.maximum_likelihood import N_EVALUATIONS, max_log_likelihood
 from .estimators.protocol import Estimate, Estimator, uses_draws
@@ -33,6 +34,9 @@ from .unreached import check_reached
 MAXIMUM = "maximum likelihood"
 CORRECTION = "correction of the draws"
 SHARED = "shared proposals"
+UNVISITED = "unvisited tails"
+# CPU seconds for the search for tails that the chains have missed; fewest draws that it needs.
+CHECK_SECONDS, LEAST_DRAWS = 1.0, 4000
 LESS_CERTAIN = "{} is less certain than its standard error suggests"
 
 
@@ -67,10 +71,11 @@ def run_estimators(
     common = (
         *support.check(),
         *check_discretisation(model, idata, posterior.draws),
-        *(stored(idata, model, OFF) if exact is None else ()),
+        *(stored_filter_checks(idata, model, OFF) if exact is None else ()),
     )
-    of_chains = tuple(check_convergence(posterior, idata))
     entropy = np.random.default_rng(random_seed).integers(2**63, size=2).tolist()
+    rng = np.random.default_rng([*entropy, crc32(UNVISITED.encode())])
+    of_chains = (*check_convergence(posterior, idata), *_missed(idata, model, posterior, rng))
     posterior = replace(posterior, shared_seed=(*entropy, crc32(SHARED.encode())))
 
     def stream(name: str) -> np.random.Generator:
@@ -108,6 +113,18 @@ def run_estimators(
         if extend_inferencedata:
             store_evidence(idata, found[name], dict(estimate.settings))
     return found
+
+
+def _missed(
+    idata: xr.DataTree, model: pm.Model, posterior: Posterior, rng: np.random.Generator
+) -> list[str]:
+    """What the chains have missed, as was found at the end of their run or is found now."""
+    if (known := stored(idata)) is not None:
+        return known
+    if posterior.log_density.size < LEAST_DRAWS:
+        return []
+    parts = posterior.draws, posterior.log_density, posterior.evaluate
+    return unvisited(model, *parts, CHECK_SECONDS, rng)
 
 
 def _where_reached(

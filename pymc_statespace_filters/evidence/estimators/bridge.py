@@ -52,11 +52,11 @@ from scipy.stats import Covariance, multivariate_normal
 from ...importance import (
     MIN_EFFECTIVE,
     LogMean,
+    bridge_constant,
     disagreement,
     log_mean_of_chains,
     log_mean_of_independent,
 )
-from ..pooled import bridge_constant
 from ..posterior import Posterior, check_overlap
 from .protocol import Estimate
 from .stopping import check_target, is_small, shortfall, totals

@@ -28,6 +28,7 @@ from ..output.report import (
     until_ess_warning,
 )
 from ..output.sample_stats import stat_dims, whole_chain
+from ..output.unvisited import unvisited_warnings
 from ..output.warnings import (
     LOWER,
     STANDSTILL,
@@ -355,6 +356,10 @@ class ModelTask:
         }
         if states is not None:
             tree[GROUP] = states
+        if check_convergence and "posterior" in tree:
+            with suppress(KeyboardInterrupt):
+                rng, seconds = side_generator(key, 3), self._ended - self._began
+                noise_warnings += unvisited_warnings(tree, self.model, seconds, rng)
         check = self._check_filters(tree, key) if check_convergence else FilterCheck()
         noise_warnings += unreached
         if not unreached and warnings.keys().isdisjoint({STANDSTILL, LOWER}):  # which explain it

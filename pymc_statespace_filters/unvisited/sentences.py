@@ -1,0 +1,84 @@
+"""The check in words: which parameter of a model, where, and how much is missing.
+
+The words are stored with the draws, so that the evidence need not look again.
+"""
+
+import json
+import time
+from collections.abc import Sequence
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+from numpy.typing import NDArray
+
+from ..pymc_model.density import ConstrainedValues
+from ..pymc_model.inspection import element_names
+from .check import MissedTail, missed_tails
+from .tail_proposals import Evaluate
+
+ATTRIBUTE = "unvisited"  # of results, a JSON text
+N_TIMED = 20  # evaluations whose time is measured
+
+Array = NDArray[np.float64]
+
+
+def unvisited(
+    model: pm.Model,
+    draws: Array,
+    log_density: Array,
+    evaluate: Evaluate,
+    seconds: float,
+    rng: np.random.Generator,
+) -> list[str]:
+    """Say of which tails the draws have missed a part, see `missed_tails`.
+
+    ``seconds`` of CPU time are for all evaluations.
+    """
+    x = draws.reshape(-1, draws.shape[-1])
+    timed = x[:: max(1, len(x) // N_TIMED)]
+    evaluate(timed[:1], rng)  # the first call may compile
+    began = time.process_time()
+    evaluate(timed, rng)
+    each = max((time.process_time() - began) / len(timed), 1e-7)
+    found = missed_tails(draws, log_density, evaluate, seconds / each, rng)
+    return [_sentence(model, one) for one in found]
+
+
+def store(idata: xr.DataTree, sentences: Sequence[str]) -> None:
+    """Keep the outcome with the draws."""
+    idata.attrs[ATTRIBUTE] = json.dumps(list(sentences))
+
+
+def stored(idata: xr.DataTree) -> list[str] | None:
+    """The outcome that is kept with the draws; None if they were not checked."""
+    return json.loads(idata.attrs[ATTRIBUTE]) if ATTRIBUTE in idata.attrs else None
+
+
+def _sentence(model: pm.Model, missed: MissedTail) -> str:
+    index = missed.tail.parameter
+    name = element_names(model)[index]
+    where = _where(model, missed)
+    return (
+        f"the chains have missed a part of the posterior {where.format(name=name)}: "
+        f"{missed.draws:.1%} of the draws lie there, and at least {missed.posterior:.1%} of the "
+        f"posterior ({missed.errors:.1f} standard errors more), so that means, intervals and the "
+        "evidence lack it; reparametrise the model there (a non-centred form of a hierarchical "
+        "one), or draw longer chains with smaller steps"
+    )
+
+
+def _where(model: pm.Model, missed: MissedTail) -> str:
+    """The region in the model's units; unconstrained if the elements differ from these."""
+    values = ConstrainedValues(model)
+    flat = [
+        np.concatenate([np.ravel(value) for value in values(x).values()])
+        for x in (missed.at_edge, missed.furthest)
+    ]
+    if len(flat[0]) != len(missed.at_edge):
+        side = "above" if missed.tail.side > 0 else "below"
+        return (
+            f"where {{name}}, unconstrained, is {side} {missed.at_edge[missed.tail.parameter]:.3g}"
+        )
+    edge, furthest = (float(one[missed.tail.parameter]) for one in flat)
+    return f"where {{name}} is {'above' if furthest > edge else 'below'} {edge:.3g}"
