@@ -23,6 +23,7 @@ from ..system.panel_records import FIRST_INPUT, RECORD, STEP
 from .held_seed import warn_of_held_seed
 from .inspection import state_space_nodes
 from .random_variable import PanelRV, StateSpaceRV, draw_in_python
+from .stepped import warn_of_steps
 from .unused_priors import warn_of_unused_priors
 
 _TOO_SHORT = "score_from must be less than the number of observations, of which there are too few"
@@ -113,6 +114,7 @@ def _log_density(
     (value,) = values
     theta, steps, inputs, t0, seed = params
     _warn_about_model(op)
+    warn_of_steps(op.system, theta)
     likelihood = LogLikelihood(op.system, op.filter)
     terms = vectorized(likelihood, theta, steps, value, inputs, t0, seed)[0]
     if op.score_from == 0:
@@ -131,6 +133,7 @@ def _log_density_of_panel(
     (value,) = values
     theta, rows, inputs, t0, seed = params
     _warn_about_model(op)
+    warn_of_steps(op.system, theta)
     likelihood = LogLikelihood(op.system, op.filter, PANEL)
     terms = vectorized(likelihood, theta, rows, value, inputs, t0, seed)[0]
     if op.score_from == 0:

@@ -20,7 +20,7 @@ from ..filters.recommendation import short_form
 
 _SAMPLERS = ("pymc.step_methods.", "pymc.smc.")
 # Those with gradients, of which there are none: an error says so.
-_WITH_GRADIENT = ("pymc.step_methods.hmc.", "pymc.step_methods.arraystep.")
+WITH_GRADIENT = ("pymc.step_methods.hmc.", "pymc.step_methods.arraystep.")
 _GRAPHS = ("pymc.logprob.", "pymc.model.", "pytensor.", "functools", f"{__package__}.")
 # Files between a warning and the line of the user.
 INSIDE = (
@@ -32,8 +32,8 @@ INSIDE = (
 
 def warn_of_held_seed(filter: Filter) -> None:
     """Warn if a sampler of PyMC asks for the log-density of a filter with noise."""
-    who = _asks_from() if filter.noisy else ""
-    if who.startswith(_SAMPLERS) and not who.startswith(_WITH_GRADIENT):
+    who = asks_from() if filter.noisy else ""
+    if who.startswith(_SAMPLERS) and not who.startswith(WITH_GRADIENT):
         warnings.warn(
             f"{short_form(filter)}: this sampler evaluates the estimated likelihood with one noise "
             "seed throughout. If it moves parameters of the likelihood, its draws are those of the "
@@ -44,7 +44,7 @@ def warn_of_held_seed(filter: Filter) -> None:
         )
 
 
-def _asks_from() -> str:
+def asks_from() -> str:
     """The name of the module that asks for the log-density, with a dot behind it."""
     frame: FrameType | None = sys._getframe(1)
     while frame is not None:

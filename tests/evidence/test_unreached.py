@@ -82,10 +82,10 @@ def test_an_evidence_of_chains_that_were_elsewhere_has_no_error():
     with pm.Model() as model:
         mu = pm.Normal("mu", 0, 10)
         pm.Normal("y", mu, 0.15, observed=[0.2, -0.1])
-    with pytest.warns(psf.EvidenceWarning, match="never reached the posterior"):
+    with pytest.warns(psf.errors.EvidenceWarning, match="never reached the posterior"):
         found = psf.estimate_evidence(idata, model, random_seed=1, progressbar=False)
     for evidence in found.values():
         assert np.isnan(evidence.se)
         assert "nats above that of the best draw" in evidence.doubts
-    with pytest.raises(psf.ModelError, match="never reached the posterior"):
+    with pytest.raises(psf.errors.ModelError, match="never reached the posterior"):
         psf.compare_evidence({"one": idata, "other": idata})

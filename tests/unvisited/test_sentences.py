@@ -66,7 +66,7 @@ def test_an_evidence_of_draws_that_lack_a_tail_is_doubted():
         mu = pm.Normal("mu")
         pm.Potential("nothing", 0.0 * mu)
     with pytest.warns(
-        psf.EvidenceWarning, match="missed a part of the posterior where mu is below"
+        psf.errors.EvidenceWarning, match="missed a part of the posterior where mu is below"
     ):
         found = psf.chib_jeliazkov(idata, model, random_seed=1, progressbar=False)
     assert "of the draws lie there" in found.doubts

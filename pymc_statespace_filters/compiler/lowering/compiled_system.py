@@ -15,7 +15,7 @@ from . import quantiles, structure
 from .constants import covariances, extend, followed_by_square_roots, lowered, pull_back
 from .guidance import guided_noise, linearize_step, n_gains, observation_information
 from .guide_loops import follow, look_back
-from .jumps import jumping_equations
+from .jumps import jumping_equations, stepped_parameters
 from .observation import expected_observation, observation_log_density
 from .symbols import call, symbols_of, uses
 
@@ -288,6 +288,11 @@ class CompiledSystem:
     def jumping_equations(self) -> tuple[str, ...]:
         """Those of "transition" and "observation" that are known to jump in the state."""
         return jumping_equations(self.model)
+
+    @cached_property
+    def stepped_parameters(self) -> tuple[str, ...]:
+        """Parameters of which every likelihood is known to be a staircase."""
+        return stepped_parameters(self.model)
 
     @cached_property
     def has_smooth_sensor(self) -> bool:

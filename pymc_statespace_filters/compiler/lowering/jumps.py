@@ -1,11 +1,17 @@
-"""Whether an equation jumps as the state moves: decided on lines through the state space.
+"""Whether an equation jumps as the state or a parameter moves: decided on lines.
 
 A jump can only be where an operation of `_STEPPED`, such as the comparison of a switch, changes its
 value. Such places are searched on lines, at random parameters, and the equation is evaluated on
 both sides: at a kink, as of ``pt.switch(x > 0, x, 0)``, it leaves no gap. A gap counts beside the
 noise: where a force jumps, the state of a short step jumps by little, and is as good as continuous.
+
+A parameter that is compared with nothing but times, inputs and parameters, as in
+``pt.switch(t < tau, a, b)``, makes every likelihood a staircase: between two steps of the time it
+does not change. There any gap counts. The threshold of a state is another matter, because its noise
+smooths the steps.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 
@@ -65,6 +71,52 @@ def jumping_equations(system: StateSpaceModel) -> tuple[str, ...]:
     return tuple(found)
 
 
+def stepped_parameters(system: StateSpaceModel) -> tuple[str, ...]:
+    """Parameters of which every likelihood is a staircase; none where that is undecided."""
+    system = system.gaussian
+    symbols = symbols_of(system)
+    moments = [*transition_moments(system, symbols)]
+    if system.equations.observation is not None:
+        moments += observation_moments(system, symbols)
+    try:
+        (elements,) = unrolled(Graph(symbols, [pt.concatenate([m.ravel() for m in moments])]))
+    except NotUnrollableError:
+        return ()
+    everything = _under(elements)
+    inputs = {e.args[0] for e in everything if e.op is None}
+    moving = frozenset(name for name in inputs if name.split(".")[0] in ("x", "q", "e"))
+    stepped = {e for e in everything if isinstance(e.op, _STEPPED)} - depends_on(elements, moving)
+    scalars = np.repeat(system.parameters, [math.prod(s) for s in system.parameter_shapes])
+    found = [
+        name
+        for i, name in enumerate(scalars)
+        if _jumps_in(
+            f"theta.{i}", elements, stepped & depends_on(elements, frozenset({f"theta.{i}"}))
+        )
+    ]
+    return tuple(dict.fromkeys(map(str, found)))
+
+
+def _jumps_in(name: str, elements: Sequence[Value], stepped: set[Expression]) -> bool:
+    """Whether elements jump as one input moves, on some line."""
+    if not stepped:
+        return False
+    order = sorted(_under(elements), key=lambda e: e.number)
+    ordered = [e for e in order if e in stepped]
+    rng = np.random.default_rng(0)
+    with_noise = [*elements, *np.ones(len(elements))]  # a gap counts as it is
+    lines = [_on_line(order, with_noise, ordered, frozenset({name}), rng) for _ in range(_N_LINES)]
+    distances = _distances(len(order))
+    return any(_largest_gap(line, distances, len(elements)) > 0.0 for line in lines)
+
+
+def _distances(n_operations: int) -> np.ndarray:
+    """Points of a line, of so many operations each, close together near its middle."""
+    n_points = int(np.clip(_MOST_EVALUATIONS / (_N_LINES * n_operations), 16, 200)) // 2
+    far = np.geomspace(1e-3, 1e8, n_points)  # thresholds have the scale of the state
+    return np.concatenate([-far[::-1], [0.0], far])
+
+
 def _jumps(elements: Sequence[Value], states: frozenset[str], n: int) -> bool:
     """Whether the first n elements jump by more than the noise, whose variances are the others.
 
@@ -77,9 +129,7 @@ def _jumps(elements: Sequence[Value], states: frozenset[str], n: int) -> bool:
     # Numbers follow the order in which expressions were made: arguments come first.
     order = sorted(everything, key=lambda e: e.number)
     stepped = [e for e in order if e in of_mean and isinstance(e.op, _STEPPED)]
-    n_points = int(np.clip(_MOST_EVALUATIONS / (_N_LINES * len(order)), 16, 200)) // 2
-    far = np.geomspace(1e-3, 1e8, n_points)  # thresholds have the scale of the state
-    distances = np.concatenate([-far[::-1], [0.0], far])
+    distances = _distances(len(order))
     rng = np.random.default_rng(0)
     lines = [_on_line(order, elements, stepped, states, rng) for _ in range(_N_LINES)]
     gaps = [gap for line in lines if (gap := _largest_gap(line, distances, n)) > 0.0]

@@ -358,8 +358,8 @@ class ModelTask:
             tree[GROUP] = states
         if check_convergence and "posterior" in tree:
             with suppress(KeyboardInterrupt):
-                rng, seconds = side_generator(key, 3), self._ended - self._began
-                noise_warnings += unvisited_warnings(tree, self.model, seconds, rng)
+                rng = side_generator(key, 3)
+                noise_warnings += unvisited_warnings(tree, self.model, self._seconds, rng)
         check = self._check_filters(tree, key) if check_convergence else FilterCheck()
         noise_warnings += unreached
         if not unreached and warnings.keys().isdisjoint({STANDSTILL, LOWER}):  # which explain it
