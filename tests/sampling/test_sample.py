@@ -188,13 +188,12 @@ def test_what_decides_is_the_dimension_and_the_cost():
     assert not better(40, 1e-6)  # less than the gradient takes to compile
 
 
-@pytest.fixture(scope="module", params=["walk", "records", "noise"])
+@pytest.fixture(scope="module", params=["noise", "records"])
 def two_parts(request, tmp_path_factory):
     """A run in one piece, and in two with a file between them."""
     from tests.sampling.test_record_chains import panel_model
 
     model = {
-        "walk": simple_model,
         "records": lambda: panel_model(psf.EKF()),
         "noise": lambda: state_space_model(psf.BootstrapPF(20)),
     }[request.param]()
