@@ -153,13 +153,20 @@ def health_outputs(graphs: Sequence[Variable]) -> list[TensorVariable]:
 
 
 def gradient_obstacle(model: pm.Model) -> str:
-    """Why gradients of a likelihood do not help a sampler; empty if they do."""
+    """Why a model has no gradient; empty if its filters have one."""
     for name, node in state_space_nodes(model).items():
+        if node.op.filter.noisy:
+            return f"the likelihood of {name!r} is estimated with noise"
         if not node.op.filter.has_gradient:
             return f"the likelihood of {name!r} has no gradient"
-        if not compile_system(node.op.system).is_smooth:
-            return f"the equations of {name!r} have kinks or jumps"
     return ""
+
+
+def kinked_variable(model: pm.Model) -> str | None:
+    """The StateSpace variable whose equations have kinks or jumps, or may have."""
+    nodes = state_space_nodes(model).items()
+    kinked = (name for name, node in nodes if not compile_system(node.op.system).is_smooth)
+    return next(kinked, None)
 
 
 def exactness(model: pm.Model) -> bool:

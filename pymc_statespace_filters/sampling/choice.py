@@ -8,7 +8,8 @@ import pytensor
 from pymc.model import Model
 
 from ..pymc_model.density import ModelDensity
-from ..pymc_model.inspection import gradient_obstacle, noisy_filters
+from ..pymc_model.inspection import gradient_obstacle, kinked_variable
+from ..pymc_model.stepped import stepped_variables
 
 DRAM, NUTS = "dram", "nuts"
 
@@ -35,15 +36,20 @@ class Choice(NamedTuple):
 
 
 def choose_sampler(model: Model, chains: int, tune: int) -> Choice:
-    """The sampler that takes less time, of those that are able to sample the model."""
-    if reason := _obstacle(model):
+    """The sampler that takes less time, of those that suit the model."""
+    if reason := gradient_obstacle(model):
         return Choice(DRAM, reason)
+    if kinked := kinked_variable(model):
+        return Choice(DRAM, f"the equations of {kinked!r} have kinks or jumps")
     dim = _initial_position(model).size
     cost = seconds_per_evaluation(model)
     seconds = {name: expected_seconds(name, dim, cost, chains, tune) for name in (DRAM, NUTS)}
     quicker = min(seconds, key=lambda name: seconds[name])
-    if quicker == NUTS and (reason := _missing_gradient(model)):
-        return Choice(DRAM, reason)
+    if quicker == NUTS:
+        if steps := stepped_variables(model):
+            return Choice(DRAM, f"the likelihood is a staircase of {steps[0]}")
+        if reason := _missing_gradient(model):
+            return Choice(DRAM, reason)
     return Choice(
         quicker,
         f"{dim} parameters and {1e3 * cost:.2g} ms a log-density: about {seconds[DRAM]:.2g} CPU s "
@@ -61,14 +67,8 @@ def expected_seconds(sampler: str, dim: int, cost: float, chains: int, tune: int
 
 
 def why_no_nuts(model: Model) -> str:
-    """What keeps NUTS from sampling a model; empty if nothing does."""
-    return _obstacle(model) or _missing_gradient(model)
-
-
-def _obstacle(model: Model) -> str:
-    if noisy := list(noisy_filters(model)):
-        return f"the likelihood of {noisy[0]!r} is estimated with noise"
-    return gradient_obstacle(model)
+    """What makes it impossible that NUTS samples a model; empty if nothing does."""
+    return gradient_obstacle(model) or _missing_gradient(model)
 
 
 def _missing_gradient(model: Model) -> str:

@@ -171,7 +171,8 @@ def test_the_choice():
     assert choice.why_no_nuts(linear_model(3)) == ""
     assert "noise" in choice.why_no_nuts(linear_model(3, psf.BootstrapPF(10)))
     assert "no gradient" in choice.why_no_nuts(linear_model(3, psf.GridFilter()))
-    assert "kinks" in choice.why_no_nuts(linear_model(3, kink=True))
+    kinked = choice.choose_sampler(linear_model(200, kink=True), 4, 1000)
+    assert kinked == ("dram", "the equations of 'd' have kinks or jumps")
     few, many = (choice.choose_sampler(linear_model(n), 4, 1000) for n in (3, 200))
     assert (few.sampler, many.sampler) == ("dram", "nuts")
     assert few.reason.startswith("3 parameters and ")
