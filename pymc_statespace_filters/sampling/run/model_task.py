@@ -45,8 +45,8 @@ from .continuation import GROUP, stored_states
 from .population_search import (
     SearchedPoints,
     WarmUp,
+    first_cov,
     search_population,
-    searched_cov,
     stops_of,
 )
 from .record_chain import chain_of
@@ -138,7 +138,8 @@ class ModelTask:
         population = self.population if request.initvals is None else None
         cov = None
         if isinstance(target, Target):
-            cov = searched_cov(request, target, population)
+            given = self._candidates[index](np.random.default_rng(0))[-1]
+            cov = first_cov(request, target, population, given)
         return ChainTask(
             target,
             request.tune,

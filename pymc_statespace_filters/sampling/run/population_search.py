@@ -14,6 +14,7 @@ from ..kernel.independence import no_mixture
 from ..kernel.proposal_mixture import fitted_mixture, improved_mixture, warmup_parts
 from ..kernel.state import Draws
 from ..starts.annealing import N_SWEEPS
+from ..starts.local_scale import local_cov
 from ..starts.modes import modes_message, modes_warning
 from ..starts.population import MANY_DIMENSIONS, N_POINTS, find_population
 from ..target.target import Target
@@ -172,14 +173,18 @@ def n_search_points(request: SamplingRequest, target: Target) -> int:
     return max(iterations // _PER_POINT, _FEWEST_POINTS)
 
 
-def searched_cov(
-    request: SamplingRequest, target: Target, population: np.ndarray | None
+def first_cov(
+    request: SamplingRequest, target: Target, population: np.ndarray | None, start: np.ndarray
 ) -> np.ndarray | None:
-    """The first proposal covariance after a search; None if it is the user's or the prior's.
+    """The first proposal covariance: of the population, or where the user starts a chain.
 
-    The prior may be a thousand times too wide.
+    None if it is the user's, or the prior's, which may be a thousand times too wide.
     """
-    if population is None or request.proposal_cov is not None:
+    if request.proposal_cov is not None:
+        return None
+    if request.initvals is not None:
+        return local_cov(target, start)
+    if population is None:
         return None
     points = standardised(population)
     if points is None:
