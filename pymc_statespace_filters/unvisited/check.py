@@ -44,7 +44,7 @@ N_TAILS = 2  # that are looked at
 FALSE_ALARMS = 0.02  # probability of a finding in any tail, if there is none
 DEGREES_OF_FREEDOM = 30  # of the errors, of some hundred effective draws and points
 MIN_MISSED, MIN_EFFECTIVE = 0.02, 50.0
-MOST_DRAWS = 20_000  # draws that are compared
+MOST_DRAWS, MIN_DRAWS = 20_000, 50  # that are compared; different ones in a tail, at least
 N_EVALUATIONS = N_BRIDGE + N_TAILS * sum(SIZES)
 LEAST_SHARE = 0.2  # of these, with which the errors are not too large for a finding
 
@@ -131,6 +131,8 @@ def _missed(
     for index, side in _highest(draws, log_density):
         tails = [_tail(draws, index, side, share) for share in SHARES]
         inside = draws[tails[0].distance(draws) > 0]
+        if len(np.unique(inside[:, index])) < MIN_DRAWS:
+            continue
         points = weighted_points(tails[0], inside, evaluate, part, rng)
         found.append(max((_compared(t, draws, points, log_evidence) for t in tails), key=_errors))
     limit = student.isf(FALSE_ALARMS / (N_TAILS * len(SHARES)), DEGREES_OF_FREEDOM)
@@ -147,7 +149,7 @@ def _highest(draws: Array, log_density: Array) -> list[tuple[int, int]]:
     k = draws.shape[-1]
     sides = [(index, side) for index in range(k) for side in (-1, 1)]
     inside = [_tail(draws, index, side, SHARES[0]).distance(draws) > 0 for index, side in sides]
-    means = [float(log_density[one].mean()) for one in inside]
+    means = [float(log_density[one].mean()) if one.any() else -np.inf for one in inside]
     return [sides[i] for i in np.argsort(means)[::-1][:N_TAILS]]
 
 
@@ -180,7 +182,10 @@ def _compared(
     """Compare the shares of the draws and of the posterior in a tail."""
     distance = tail.distance(draws)
     inside = distance > 0
-    share, x, order = float(inside.mean()), draws[inside], np.argsort(distance[inside])
+    share = float(inside.mean())
+    if not 0 < share < 1:  # a chain that stands still may be all of a small tail
+        return MissedTail(tail, share, 0.0, 0.0, draws[0, 0], draws[0, 0])
+    x, order = draws[inside], np.argsort(distance[inside])
     mass = _truncated(np.where(tail.distance(points.x) > 0, points.log_weights, -np.inf))
     posterior = errors = 0.0
     if mass.n_effective > MIN_EFFECTIVE:

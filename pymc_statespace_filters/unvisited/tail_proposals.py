@@ -92,7 +92,8 @@ class Refined:
     def __init__(self, tail: Tail, first: Extension, x: Array, rng: np.random.Generator) -> None:
         self._tail, self._first = tail, first
         fitted = standardised(tail.to_log(x))
-        assert fitted is not None, "points that do not vary"
+        if fitted is None:
+            raise np.linalg.LinAlgError("points that do not vary in every direction")
         mixture = fit_mixture(fitted.z, place_components(fitted.z, N_COMPONENTS, rng))
         self._mixture = mixture.affine(fitted.mean, fitted.chol)
 

@@ -80,6 +80,15 @@ def test_the_number_of_evaluations_is_kept(monkeypatch):
     assert made == 0
 
 
+def test_chains_that_stand_still_are_left_alone():
+    """A tenth of the draws is one point, the last of a tail; or all of the tail is few points."""
+    draws, log_density, evaluate = drawn(Correlated(2), 1, n=500)
+    for still in (np.s_[0, :200], np.s_[:2, :450]):
+        stuck = draws.copy()
+        stuck[still] = [-5.0, -5.0]
+        missed_tails(stuck, log_density, evaluate, ALL, np.random.default_rng(1))
+
+
 def test_draws_that_do_not_vary_in_every_direction_are_left_alone():
     draws, log_density, evaluate = drawn(Correlated(3), 1, n=500)
     for wrong in (draws * [1.0, 1.0, 0.0], draws[..., [0, 1, 1]]):
