@@ -32,10 +32,13 @@ def one_record(idata: xr.DataTree, group: str, name: str, record: Any) -> xr.Dat
     return xr.DataTree.from_dict(found)
 
 
-def with_rows_of_panel(idata: xr.DataTree, group: str, name: str) -> xr.DataTree:
+def with_rows_of_panel(
+    idata: xr.DataTree, group: str, name: str, labels: Sequence[Any] | None
+) -> xr.DataTree:
     """Give a group of PyMC's the record and the time of each row, which constant data have.
 
-    A variable without a panel is left as it is.
+    ``labels`` are those of the records, if they are known. A variable without a panel is left as it
+    is.
     """
     if "constant_data" not in idata.children or f"{name}_panel" in idata[group].coords:
         return idata
@@ -43,19 +46,11 @@ def with_rows_of_panel(idata: xr.DataTree, group: str, name: str) -> xr.DataTree
     if f"{name}_panel" not in known:
         return idata
     results = idata[group].to_dataset()
-    coords = _coords_of_rows(known, name, _labels_of_records(idata, name), results[name].dims[-2])
+    coords = _coords_of_rows(known, name, labels, results[name].dims[-2])
     return xr.DataTree.from_dict(
         {child: node.to_dataset() for child, node in idata.children.items()}
         | {group: results.assign_coords(coords)}
     )
-
-
-def _labels_of_records(idata: xr.DataTree, name: str) -> list[Any] | None:
-    """The labels of the records, if a variable of any group is along them."""
-    for node in idata.children.values():
-        if (labels := node.coords.get(f"{name}_record")) is not None:
-            return list(labels.values.tolist())
-    return None
 
 
 class Facets(NamedTuple):

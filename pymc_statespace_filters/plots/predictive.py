@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import pymc as pm
 import xarray as xr
 from arviz_plots import PlotCollection
 
@@ -14,6 +15,7 @@ from .results import group_of, variable_of
 def plot_predictive(
     idata: xr.DataTree,
     *,
+    model: pm.Model | None = None,
     group: str = "posterior_predictive",
     var_name: str | None = None,
     records: Any = None,
@@ -31,6 +33,9 @@ def plot_predictive(
     ----------
     idata : xarray.DataTree
         Draws with a group of replicated observations, and the data.
+    model : pymc.Model, optional
+        The model, whose records of a panel are then called by labels that are texts. Otherwise they
+        have numbers, unless a variable in `idata` has the dimension of the records.
     group : str
         The group: ``"posterior_predictive"``, or ``"prior_predictive"``.
     var_name : str, optional
@@ -79,7 +84,7 @@ def plot_predictive(
     group, results = group_of(idata, group)
     name = variable_of(predicted(results), var_name)
     return plot_forecast(
-        with_rows_of_panel(idata, group, name),
+        with_rows_of_panel(idata, group, name, _labels_of_records(idata, name, model)),
         group=group,
         var_name=name,
         records=records,
@@ -87,3 +92,12 @@ def plot_predictive(
         backend=backend,
         **pc_kwargs,
     )
+
+
+def _labels_of_records(idata: xr.DataTree, name: str, model: pm.Model | None) -> list[Any] | None:
+    """The labels of the records of a panel, of the model or of a variable that is along them."""
+    dim = f"{name}_record"
+    if model is not None and dim in model.coords:
+        return list(model.coords[dim])
+    found = [node.coords[dim] for node in idata.children.values() if dim in node.coords]
+    return list(found[0].values.tolist()) if found else None

@@ -1,6 +1,7 @@
 """Plots of a panel: records side by side, or one of them, as results without a panel."""
 
 import numpy as np
+import pymc as pm
 import pytest
 import xarray as xr
 
@@ -210,16 +211,17 @@ def test_what_is_refused(states):
         plot_phase(alone, "level", "level", record="A", backend="none")
 
 
-@pytest.mark.parametrize("labels", [LABELS, None])
-def test_replicated_observations_of_each_record(labels):
-    """Draws of PyMC have no record and time of a row; texts are known where results have them."""
+@pytest.mark.parametrize("known_by", ["draws", "model", None])
+def test_replicated_observations_of_each_record(known_by):
+    """Draws of PyMC have no record and time of a row; texts are in the model and some draws."""
     dims = ("chain", "draw", "d_obs", "sensor")
     tree = a_tree("posterior_predictive", "d", DRAWN[..., None], dims, "sensor")
     tree["posterior_predictive"] = tree["posterior_predictive"].to_dataset().drop_vars(ROWS)
-    if labels is not None:
-        tree["posterior"] = xr.Dataset({"rate": ("d_record", [1.0, 2.0])}, {"d_record": labels})
-    collection = plot_predictive(tree, backend="matplotlib")
-    for number, label in enumerate(LABELS if labels else [0, 1]):
+    if known_by == "draws":
+        tree["posterior"] = xr.Dataset({"rate": ("d_record", [1.0, 2.0])}, {"d_record": LABELS})
+    model = pm.Model(coords={"d_record": LABELS}) if known_by == "model" else None
+    collection = plot_predictive(tree, model=model, backend="matplotlib")
+    for number, label in enumerate(LABELS if known_by else [0, 1]):
         rows = OF_ROWS == LABELS[number]
         where = {"observable": f"{label}: level"}
         points = drawn_points(collection, "data", **where)
