@@ -225,16 +225,19 @@ def _observed_at(
 ) -> xr.DataArray:
     """Return the observations at the times of the draws: of the truth, else of the record."""
     times = draws["time"].values
+    has_dates = times.dtype.kind == "M"
+    unit = np.timedelta64(1, "s") if has_dates else 1.0
     observed = xr.full_like(draws.isel(chain=0, draw=0, drop=True), np.nan)
     for given in (truth, record):
         if given is not None:
             known = given.sortby("time").drop_duplicates("time")
-            tolerance = 1e-6 * np.min(np.diff(times), initial=1.0)
+            tolerance = 1e-6 * np.append(np.diff(times), unit).min()
             known = known.reindex(time=times, method="nearest", tolerance=tolerance)
             observed = observed.fillna(known.reindex(observable=draws["observable"]))
     if not observed.notnull().any():
+        first, last = (str(t) if has_dates else f"{t:g}" for t in times[[0, -1]])
         raise ModelError(
             "errors needs observations at the times of the predictions, "
-            f"{times[0]:g} to {times[-1]:g}, got none: give them as truth"
+            f"{first} to {last}, got none: give them as truth"
         )
     return observed

@@ -154,6 +154,22 @@ def test_units_of_observables(forecast):
     assert label["speed"]["string"] == "error of speed (m/s)"
 
 
+def test_errors_at_dates(forecast):
+    """Whatever the scale of time, the errors are those of the numbers."""
+    dated = forecast.copy(deep=True)
+    for group in ("observed_data", "predictions"):
+        times = dated[group]["d_time"]
+        dates = np.datetime64("2020-01-01", "us") + (times.values * 1e6).astype("timedelta64[us]")
+        dated[group] = dated[group].to_dataset().assign_coords(d_time=dates)
+    found = [
+        drawn(plot_forecast(one, truth=np.ones((10, 2)), errors=True, backend="none"), "errors")
+        for one in (forecast, dated)
+    ]
+    np.testing.assert_array_equal(*(one["speed"]["y"] for one in found))
+    with pytest.raises(ModelError, match=r"predictions, 2020-01-01T00:00:03\.1\d* to .*got none"):
+        plot_forecast(dated, errors=True)
+
+
 def test_what_is_refused(forecast):
     with pytest.raises(ModelError, match=r"no group 'free_run': run psf.free_run\(idata, model\)"):
         plot_forecast(forecast, group="free_run")

@@ -122,6 +122,43 @@ def test_a_guided_filter_is_exact_too():
     assert found == pytest.approx(exact_terms().sum(), abs=1e-9)
 
 
+def test_the_bootstrap_filter_has_the_likelihood_as_its_mean():
+    """Right implementations fail one time in 16000."""
+    times, rng = TIMES[:8], np.random.default_rng(3)
+    data = psf.simulate(EXACT, THETA, times=times, random_seed=rng)["observations"].values
+    settings = {"times": times, "seed": np.arange(60)}
+    found = psf.log_likelihood(EXACT, psf.BootstrapPF(500), THETA, data, **settings).sum(axis=1)
+    ratios = np.exp(found - exact_terms(times, data[:, 0]).sum())
+    assert abs(ratios.mean() - 1) < 4 * ratios.std() / np.sqrt(60)
+    assert ratios.std() < 0.5
+
+
+@pytest.mark.parametrize("stiff", [1.0, 200.0])
+def test_an_exact_step_of_any_length_is_that_of_a_grid(stiff):
+    """Two states and an offset; each time is on the grid of one system alone."""
+    systems = [
+        psf.StateSpaceModel(
+            transition=psf.ExactLinear(
+                lambda a, c=stiff: [[0.0, 1.0], [-a, -c]], [[0.0], [0.4]], dt=dt, offset=[0.1, -0.3]
+            ),
+            **SETTINGS | {"initial_mean": [0.3, 0.0], "initial_cov": np.eye(2)},
+        )
+        for dt in (0.25, 0.3)
+    ]
+    times = 0.25 * np.array([1, 2, 5, 9])
+    records = [checked_record(system, DATA[:4], times=times) for system in systems]
+    assert [record.system.is_at_any_times for record in records] == [False, True]
+    terms = [
+        psf.log_likelihood(system, psf.EKF(), {"a": 2.0}, DATA[:4], times=times)
+        for system in systems
+    ]
+    np.testing.assert_allclose(*terms, rtol=0, atol=1e-11)
+
+
+def test_local_linearization_is_exact_for_a_linear_equation():
+    assert error_of(psf.LocalLinearization, 0.3) < 1e-11
+
+
 def error_of(integrator, dt):
     system = psf.StateSpaceModel(
         transition=integrator(lambda x, a: [-a * x[0]], lambda s: [[s]], dt=dt), **SETTINGS
