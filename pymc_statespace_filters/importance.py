@@ -78,7 +78,7 @@ def disagreement(log_terms: Array) -> str:
     if not found > MAX_RHAT:
         return ""
     return (
-        f"the chains disagree about the averaged terms (R-hat {found:.2f}, above {MAX_RHAT}): "
+        f"the chains disagree about the averaged terms (R-hat {found:.3f}, above {MAX_RHAT}): "
         "draw more"
     )
 

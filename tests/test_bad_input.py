@@ -281,7 +281,7 @@ RECORDS = {
     "times not numbers": (dict(steps=None, times=["now", "then"]), "times must be numbers"),
     "dates": (
         dict(steps=None, times=np.array(["2020-01-01", "2020-01-02"], "datetime64[D]")),
-        r"times .*dates.*np.timedelta64\(1, 's'\)",
+        'unit must be the duration .* such as unit="D"',
     ),
     "durations": (dict(steps=None, times=np.arange(2).astype("timedelta64[h]")), "times .*dates"),
     "index of dates": (dict(steps=None, times=pd.date_range("2020", periods=2)), "times .*dates"),

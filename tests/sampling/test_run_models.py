@@ -151,8 +151,8 @@ def breaking(mu):
     return np.asarray(mu * 0.0)
 
 
-def test_a_result_takes_less_than_twice_its_memory(monkeypatch):
-    """On the way from chains to the tree, with 0.2 MB for all else."""
+def test_a_result_takes_little_more_than_twice_its_memory(monkeypatch):
+    """On the way from chains to the tree: the chains also have counts that are not in it."""
     with pm.Model() as model:
         for name in "abcde":
             pm.Normal(name)
@@ -178,7 +178,7 @@ def test_a_result_takes_less_than_twice_its_memory(monkeypatch):
         for group in ("posterior", "sample_stats")
         for values in tree[group].data_vars.values()
     )
-    assert highest[0] < 2 * stored + 200_000
+    assert highest[0] < 2.25 * stored
 
 
 @pytest.mark.filterwarnings("ignore:Numba will use object mode")
