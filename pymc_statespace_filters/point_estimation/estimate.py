@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-LEVEL, INCREASING, EDGE, HIDDEN = "level", "increasing", "edge", "hidden"
+LEVEL, INCREASING, EDGE, HIDDEN, STEPPED = "level", "increasing", "edge", "hidden", "stepped"
 
 Array = NDArray[np.float64]
 
@@ -17,7 +17,8 @@ class Lost(NamedTuple):
     """A direction along which the maximum has no curvature."""
 
     direction: Array  # (k,), some posterior standard deviations long
-    kind: str  # LEVEL, INCREASING, EDGE (of the support) or HIDDEN (by noise)
+    kind: str  # LEVEL, INCREASING, EDGE (of the support), HIDDEN (by noise) or STEPPED
+    interval: tuple[Array, ...] = ()  # points (k,) at its ends, of a parameter that is stepped
 
 
 class Peak(NamedTuple):

@@ -13,21 +13,33 @@ from numpy.typing import NDArray
 from pymc.model import Model
 
 from ..errors import ModelError
+from ..evidence.estimators.newton import BatchFunction
 from ..pymc_model.density import ConstrainedValues
 from ..pymc_model.inspection import given_model
 from ..pymc_model.prior import ModelFactors
+from ..pymc_model.stepped import stepped_variables
 from ..sampling.starts.annealing import N_SWEEPS, Population
 from ..sampling.starts.population import population_of
 from ..system.checks import check_random_seed
-from .estimate import EDGE, HIDDEN, INCREASING, MaximumLikelihoodEstimate, Peak, flattened
+from .estimate import (
+    EDGE,
+    HIDDEN,
+    INCREASING,
+    STEPPED,
+    MaximumLikelihoodEstimate,
+    Peak,
+    flattened,
+)
 from .noisy import maximize_estimated
 from .smooth import maximize_smooth
+from .stepped import maximize_stepped
 
 Array = NDArray[np.float64]
 
 STEP = 1e-3  # of the differences, in standard deviations of the population
 # Standard errors, of a move along a direction that changes a parameter; with noisy directions.
 INVOLVED, INVOLVED_NOISY = 0.05, 0.5
+FAR, ROUNDING = (30.0, 40.0), 1e-6  # unconstrained, where a parameter is at its bound
 AT_BOUND = 0.02  # standard deviations of the population: smaller moves end at a bound
 
 
@@ -86,8 +98,9 @@ def maximum_likelihood(
     unconstrained space: :math:`\sqrt{\operatorname{diag}(-J H^{-1} J^\top)}`, with the Jacobian J
     of the parameters in the model's units. At a maximum that is the inverse information in these
     units. They hold for long records [2]_. A parameter has none at a bound, such as a scale of
-    zero, and if the likelihood does not determine it: ``reasons`` says which. A parameter at a
-    bound counts as known for the errors of the others.
+    zero, if the likelihood does not determine it, if noise hides the curvature, or if the
+    likelihood is a staircase of it, as of the time of a switch: ``reasons`` says which, with an
+    interval for a staircase. A parameter at a bound counts as known for the errors of the others.
 
     The population costs 3000 to 16 000 evaluations of the likelihood, in threads; Newton's method
     about 50 (k + 1)² for k parameters, the quadratics 4000 to 10 000.
@@ -141,11 +154,34 @@ def maximum_likelihood(
 
     x = population_of(model, rng, progressbar=progressbar)[0].x[::N_SWEEPS]
     population = Population(x, *evaluate(x))
-    if factors.is_noisy:
-        peak = maximize_estimated(lambda x: evaluate(x)[1], population, rng)
+
+    def maximize(log_likelihood: BatchFunction, population: Population) -> Peak:
+        if factors.is_noisy:
+            return maximize_estimated(log_likelihood, population, rng)
+        return maximize_smooth(log_likelihood, population)
+
+    def log_likelihood(x: Array) -> Array:
+        return evaluate(x)[1]
+
+    stepped = _is_stepped(model)
+    if stepped.any():
+        peak = maximize_stepped(
+            log_likelihood, population, stepped, maximize, is_noisy=factors.is_noisy
+        )
     else:
-        peak = maximize_smooth(lambda x: evaluate(x)[1], population)
+        peak = maximize(log_likelihood, population)
     return _described(model, peak, population.x, n_evaluations)
+
+
+def _is_stepped(model: Model) -> NDArray[np.bool_]:
+    """Of which parameters (k,) the likelihood is a staircase."""
+    names, point = stepped_variables(model), model.initial_point()
+    return np.concatenate(
+        [
+            np.full(point[model.rvs_to_values[rv].name].size, rv.name in names)
+            for rv in model.free_RVs
+        ]
+    )
 
 
 def _described(
@@ -208,18 +244,40 @@ def errors_of(
     directions = np.array([lost.direction for lost in peak.lost]).reshape(-1, len(peak.point))
     moves = np.abs(jacobian @ directions.T)
     least = [INVOLVED_NOISY if lost.kind == HIDDEN else INVOLVED for lost in peak.lost]
-    involved = moves >= np.multiply.outer(np.linalg.norm(along, axis=1), least)
+    involved = (moves > 0) & (moves >= np.multiply.outer(np.linalg.norm(along, axis=1), least))
     reasons = {}
     for i in np.flatnonzero(involved.any(axis=1)):
         which = int(np.where(involved[i], moves[i], -1.0).argmax())
         names = [labels[j] for j in np.flatnonzero(involved[:, which])]
         small = moves[i, which] < AT_BOUND * spread[i]
         reasons[labels[i]] = _reason(peak.lost[which].kind, names, at_bound=bool(small))
+        if peak.lost[which].kind == STEPPED:
+            ends = [float(flattened(values(x))[i]) for x in peak.lost[which].interval]
+            reasons[labels[i]] = _reason_of_steps(ends)
+        covariance[i], covariance[:, i] = np.nan, np.nan
+    for i in np.flatnonzero(_at_bounds(values, peak.point, spread)):
+        reasons.setdefault(labels[i], _reason(INCREASING, [], at_bound=True))
         covariance[i], covariance[:, i] = np.nan, np.nan
     simulation = np.sqrt(np.einsum("ik,kl,il->i", jacobian, peak.simulation_cov, jacobian))
     if peak.value_se > 0:
         simulation[np.isnan(np.diag(covariance))] = np.nan
     return Errors(covariance, simulation, reasons)
+
+
+def _at_bounds(
+    values: Callable[[Array], Mapping[str, np.ndarray]], point: Array, spread: Array
+) -> NDArray[np.bool_]:
+    """Which scalars are at a finite bound of their support, measured by the population's spread.
+
+    A curvature there is that of a transform: the likelihood has none.
+    """
+    here, found = flattened(values(point)), np.zeros(len(spread), dtype=bool)
+    with np.errstate(over="ignore"):
+        for move in np.concatenate([np.eye(len(point)), -np.eye(len(point))]):
+            near, far = (flattened(values(point + far * move)) for far in FAR)
+            is_bound = np.isfinite(far) & (near != here) & (np.abs(far - near) < ROUNDING * spread)
+            found |= is_bound & (np.abs(far - here) < AT_BOUND * spread)
+    return found
 
 
 def _jacobian(function: Callable[[Array], Array], point: Array, steps: Array) -> Array:
@@ -243,6 +301,17 @@ def _reason(kind: str, names: list[str], *, at_bound: bool) -> str:
     if kind == INCREASING:
         return f"not a maximum: the Hessian is not negative definite {direction}"
     return f"not identified: the likelihood is level {direction}"
+
+
+def _reason_of_steps(ends: list[float]) -> str:
+    """Why a parameter of which the likelihood is a staircase has none, and its interval."""
+    reason = "the likelihood is a staircase of it, which a condition compares with times or data"
+    if not np.isfinite(ends).all():
+        return f"{reason}, and too noisy to search; sample_dram samples it"
+    low, high = sorted(ends)
+    return (
+        f"{reason}; within 1.92 nats of the maximum from {low:.4g} to {high:.4g}, the others held"
+    )
 
 
 def scalar_labels(model: pm.Model, values: Mapping[str, np.ndarray]) -> list[str]:

@@ -25,7 +25,7 @@ MAX_STEP = 2.0  # standard errors, from the centre of a round to the next
 NEAR = 0.5  # standard errors, of the last centre to its maximum
 N_ROUNDS, N_LAST = 8, 3  # most rounds; with the settings of the last, at least
 MAX_LENGTH = 1.0  # of a scale, in standard deviations of the population
-SIGNIFICANT = 3.0  # standard errors, of a slope
+SIGNIFICANT, KNOWN = 3.0, 2.0  # standard errors, of a slope and of a curvature
 N_VALUING = 200  # fresh estimates at the maximum
 TOO_NOISY = 0.2  # nats, standard error of their mean: the log-likelihood has a variance above 2
 
@@ -58,11 +58,24 @@ class _Surface(NamedTuple):
         """Curvatures (k,) and their directions (k, k), in columns."""
         return np.linalg.eigh(-self.hessian)
 
+    def curvature_errors(self) -> Array:
+        """Standard errors (k,) of the curvatures, from those of the coefficients."""
+        directions = self.spectrum()[1]
+        k = len(directions)
+        i, j = np.triu_indices(k)
+        slopes = 2 * directions[i] * directions[j]  # (products, k)
+        cov = self.coefficient_cov[1 + k : 1 + k + len(i), 1 + k : 1 + k + len(i)]
+        return np.sqrt(np.einsum("pk,pq,qk->k", slopes, cov, slopes))
+
+    def has_curvature(self) -> NDArray[np.bool_]:
+        """Along which directions (k,) the curvature is larger than its noise."""
+        least = np.maximum(MIN_CURVATURE, KNOWN * self.curvature_errors())
+        return np.asarray(self.spectrum()[0] > least)
+
     def inverse(self) -> Array:
         """Inverse (k, k) of minus the Hessian along the directions with curvature."""
-        curvature, directions = self.spectrum()
-        kept = directions[:, curvature > MIN_CURVATURE]
-        return kept / curvature[curvature > MIN_CURVATURE] @ kept.T
+        (curvature, directions), kept = self.spectrum(), self.has_curvature()
+        return directions[:, kept] / curvature[kept] @ directions[:, kept].T
 
     def maximum(self) -> tuple[Array, float]:
         """Maximum (k,) in z, at most `MAX_STEP` away, and how far away it would be.
@@ -110,7 +123,7 @@ def maximize_estimated(
             settings = _LAST
         point = point + scale @ z
         scale = rescaled(scale, *surface.spectrum(), spread, MAX_LENGTH)
-    return _peak(log_likelihood, surface)
+    return _peak(log_likelihood, surface, spread)
 
 
 def _fitted(
@@ -162,14 +175,16 @@ def _feature_slopes(z: Array) -> Array:
     return np.column_stack([np.zeros(k), one, products, np.diag(3 * z**2)])
 
 
-def _peak(function: BatchFunction, surface: _Surface) -> Peak:
+def _peak(function: BatchFunction, surface: _Surface, spread: Array) -> Peak:
     """The maximum of the last surface, with fresh estimates there."""
     scale, (z, distance) = surface.scale, surface.maximum()
     point = surface.centre + scale @ z
     value = log_mean_of_independent(function(np.repeat(point[None], N_VALUING, axis=0)))
-    curvature, directions = surface.spectrum()
-    kept = curvature > MIN_CURVATURE
-    lost = tuple(Lost(scale @ directions[:, i], HIDDEN) for i in np.flatnonzero(~kept))
+    (curvature, directions), kept = surface.spectrum(), surface.has_curvature()
+    hidden = scale @ directions[:, ~kept]
+    # The maximum may be anywhere in the population along a direction whose curvature is hidden.
+    hidden = hidden / np.linalg.norm(np.linalg.solve(spread, hidden), axis=0)
+    lost = tuple(Lost(direction, HIDDEN) for direction in hidden.T)
     cov = surface.maximum_cov(z)
     in_errors = np.einsum("ki,kl,li->i", directions, cov, directions)[kept] * curvature[kept]
     notes = [
@@ -177,6 +192,12 @@ def _peak(function: BatchFunction, surface: _Surface) -> Peak:
         f"{surface.n_estimates} estimates, and their noise displaces it by up to "
         f"{np.sqrt(in_errors.max(initial=0.0)):.2g} standard errors"
     ]
+    if lost:
+        notes.append(
+            "the maximum was not found: the noise of the likelihood hides its curvature along "
+            f"{len(lost)} of {len(z)} directions, so that the log-likelihood is that of the best "
+            "point found; take more particles (see suggest_particles)"
+        )
     if distance > NEAR:
         notes.append(
             f"the search did not converge: its last step was {distance:.2g} standard errors long"
