@@ -1,8 +1,8 @@
 """Draws for a given seed are those of earlier versions, for one model per kind of filter.
 
 Starts are those of the version that brought the search for starts, draws those of the version with
-small walks among the others. On one machine they are equal to the bit; the tolerance is for processors whose vector code rounds
-differently.
+small walks among the others. On one machine they are equal to the bit; the tolerance is for
+processors whose vector code rounds differently.
 """
 
 import numpy as np
