@@ -13,10 +13,12 @@ from ..pymc_model.stepped import stepped_variables
 
 DRAM, NUTS = "dram", "nuts"
 
-# Effective draws that the costs are compared for. The rest are medians of narrow posteriors of 4 to
-# 22 parameters, with wide scatter (`benchmarks/choice.py` measures both samplers):
+# Effective draws that the costs are compared for. The rest are typical of narrow posteriors of 4 to
+# 50 parameters, with wide scatter (`benchmarks/choice.py` measures both samplers); that of the walk
+# is rather low, as a walk that is slow takes ten times as long as NUTS, and NUTS at most some three
+# times as long as a walk:
 _N_EFFECTIVE = 400
-_WALK_EFFICIENCY = 0.6  # effective draws of a random walk per evaluation, times d^2
+_WALK_EFFICIENCY = 0.2  # effective draws of a random walk per evaluation, times d^2
 _NUTS_EFFICIENCY = 0.04  # effective draws of NUTS per gradient
 _NUTS_STEPS = 12  # gradients of an iteration of its warm-up
 _GRADIENT = 3.0  # cost of a gradient, in log-densities

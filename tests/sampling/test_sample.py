@@ -184,9 +184,9 @@ def test_what_decides_is_the_dimension_and_the_cost():
             "nuts", dim, cost, 4, 1000
         )
 
-    assert not any(better(dim, cost) for dim in (1, 5, 11) for cost in (1e-6, 1e-4, 1e-2))
-    assert all(better(40, cost) for cost in (1e-4, 1e-2))
-    assert not better(40, 1e-6)  # less than the gradient takes to compile
+    assert not any(better(dim, cost) for dim in (1, 5, 8) for cost in (1e-6, 1e-4, 1e-2))
+    assert all(better(dim, cost) for dim in (15, 40) for cost in (1e-4, 1e-2))
+    assert not better(30, 1e-6)  # less than the gradient takes to compile
 
 
 @pytest.fixture(scope="module", params=["noise", "records"])
