@@ -137,7 +137,7 @@ def sampling() -> list[Chains]:
     return [
         of_runs("psf.sample_dram()", psf.sample_dram),
         of_runs(
-            "psf.sample_dram(stages=1)",
+            "psf.sample_dram(), one stage",
             partial(psf.sample_dram, kernel=psf.RandomWalkSettings(stages=1)),
         ),
         by_pymc("pm.sample(step=psf.DRAM())", psf.DRAM),
