@@ -61,6 +61,7 @@ def test_terms_add_up_to_the_estimate_that_the_chain_stored(idata, terms):
     assert len(np.unique(idata["sample_stats"]["d_seed"])) > 5
 
 
+@pytest.mark.filterwarnings("ignore:BootstrapPF")  # twenty particles are few
 def test_each_term_is_that_of_the_likelihood_without_pymc(idata, terms):
     for chain, draw in ((0, 3), (1, 59)):
         at = {"chain": chain, "draw": draw}

