@@ -135,7 +135,8 @@ def _missed(
             continue
         points = weighted_points(tails[0], inside, evaluate, part, rng)
         found.append(max((_compared(t, draws, points, log_evidence) for t in tails), key=_errors))
-    limit = student.isf(FALSE_ALARMS / (N_TAILS * len(SHARES)), DEGREES_OF_FREEDOM)
+    # Nested tails hold the same draws, and count as one; those not looked at do not count.
+    limit = student.isf(FALSE_ALARMS / max(len(found), 1), DEGREES_OF_FREEDOM)
     missed = [m for m in found if m.errors > limit and m.posterior > m.draws + MIN_MISSED]
     return sorted(missed, key=_errors, reverse=True)
 

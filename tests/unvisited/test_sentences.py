@@ -74,8 +74,9 @@ def test_an_evidence_of_draws_that_lack_a_tail_is_doubted():
     assert psf.chib_jeliazkov(idata, model, random_seed=1, progressbar=False).doubts == ""
 
 
-def test_a_run_warns_and_keeps_what_it_has_found(monkeypatch, caplog):
-    said = []
+@pytest.mark.parametrize("sampler", ["dram", "nuts"])
+def test_a_run_warns_and_keeps_what_it_has_found(sampler, monkeypatch, caplog):
+    call, said = {"tune": 300, "sampler": sampler, "random_seed": 1, "progressbar": False}, []
 
     def found(*args):
         said.append(args)
@@ -84,14 +85,15 @@ def test_a_run_warns_and_keeps_what_it_has_found(monkeypatch, caplog):
     with pm.Model():
         mu = pm.Normal("mu")
         pm.Normal("y", mu, 1.0, observed=[0.3, 0.1])
-        right = psf.sample_dram(1000, tune=300, random_seed=1, progressbar=False)
+        right = psf.sample(1000, **call)
         monkeypatch.setattr(at_end_of_run, "unvisited", found)
-        with caplog.at_level(logging.WARNING, logger="pymc.stats.convergence"):
-            missed = psf.sample_dram(1000, tune=300, random_seed=1, progressbar=False)
-            few = psf.sample_dram(400, tune=300, random_seed=1, progressbar=False)
+        with caplog.at_level(logging.DEBUG, logger="pymc.stats.convergence"):
+            missed = psf.sample(1000, **call)
+            few = psf.sample(400, **call)
     assert stored(right) == []
     assert stored(missed) == ["the chains have missed it"]
     assert "The chains have missed it." in caplog.text
+    assert caplog.text.count("No problems found.") == 1  # of the short run
     assert stored(few) is None
     assert len(said) == 1
     np.testing.assert_array_equal(right["posterior"]["mu"], missed["posterior"]["mu"])

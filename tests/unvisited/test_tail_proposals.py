@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import norm
 
 from pymc_statespace_filters.importance import log_mean_of_independent
-from pymc_statespace_filters.unvisited.tail_proposals import Tail, weighted_points
+from pymc_statespace_filters.unvisited.tail_proposals import Straightened, Tail, weighted_points
 from tests.evidence.hard_targets import Correlated, Funnel
 from tests.evidence.targets import autoregressive
 
@@ -35,9 +35,32 @@ def test_the_mean_weight_is_the_mass_of_the_tail(target, tail, log_mass):
     assert found.value == pytest.approx(log_mass, abs=4 * found.error)
 
 
-def test_coordinates_are_inverse():
+@pytest.mark.parametrize("target", [Funnel(4), Correlated(1)])
+def test_coordinates_are_inverse_and_their_jacobian_is_that_of_differences(target):
     rng = np.random.default_rng(2)
-    for tail in (Tail(1, 1, 0.3), Tail(1, -1, 0.3)):
-        x = rng.standard_normal((20, 3))
-        x = x[tail.distance(x) > 0]
-        np.testing.assert_allclose(tail.from_log(tail.to_log(x)), x)
+    draws = target.transport(rng.standard_normal((2000, target.n_normals)))
+    for side in (1, -1):
+        tail = Tail(0, side, 0.3)
+        inside = draws[tail.distance(draws) > 0]
+        coordinates = Straightened(tail, inside)
+        x = inside[:3] + [
+            [side * 30.0 * (i == 2)] + [0.0] * (inside.shape[1] - 1) for i in range(3)
+        ]
+        y, log_det = coordinates.of(x)
+        np.testing.assert_allclose(coordinates.at(y), x)
+        step = 1e-6 * np.eye(inside.shape[1])
+        for at, expected in zip(x, log_det, strict=True):
+            slopes = (coordinates.of(at + step)[0] - coordinates.of(at - step)[0]) / 2e-6
+            assert np.linalg.slogdet(slopes)[1] == pytest.approx(expected, abs=1e-4)
+
+
+def test_a_funnel_is_straight_in_them():
+    """The standard deviations of a funnel are exp(half its first parameter)."""
+    rng = np.random.default_rng(3)
+    draws = Funnel(4).transport(rng.standard_normal((20_000, 4)))
+    tail = Tail(0, -1, 1.0)
+    inside = draws[tail.distance(draws) > 0]
+    y = Straightened(tail, inside).of(inside)[0]
+    halves = (y[:, 0] > np.median(y[:, 0]), y[:, 0] <= np.median(y[:, 0]))
+    far, near = (y[half, 1:].std(axis=0) for half in halves)
+    np.testing.assert_allclose(far, near, rtol=0.25)  # of x itself: a factor of three

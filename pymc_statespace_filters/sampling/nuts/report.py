@@ -20,10 +20,14 @@ _TOLERATED = 0.001
 
 
 def messages_of(
-    chains: NutsChains, request: SamplingRequest, names: Sequence[str], level: str
+    chains: NutsChains,
+    missed: Sequence[SamplerWarning],
+    request: SamplingRequest,
+    names: Sequence[str],
+    level: str,
 ) -> list[SamplerWarning]:
-    """A warning for each cause, and the report."""
-    problems = _problems(chains, names)
+    """A warning for each cause, with those of tails that were missed, and the report."""
+    problems = [*_problems(chains, names), *missed]
     if request.until_ess is not None and not is_enough(request, chains.found):
         slowest = names[0] if chains.found is None else names[int(chains.found.rhat.argmax())]
         n, ways = chains.length.n_iterations, f"use sampler='dram', or reparametrise {slowest}"

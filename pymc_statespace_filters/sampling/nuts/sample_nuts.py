@@ -15,6 +15,7 @@ from ...parallel.cpu_affinity import available_cores
 from ...pymc_model.inspection import element_names, exactness, filters_used
 from ..output.datatree import to_datatree
 from ..output.filter_check import FilterCheck, check_filters, warn_of_filters
+from ..output.unvisited import unvisited_warnings
 from ..run.request import SamplingRequest
 from ..starts.modes import modes_message, modes_warning
 from ..starts.population import find_population
@@ -48,13 +49,15 @@ def sample_nuts(
     if not chains.positions.shape[1]:
         raise KeyboardInterrupt("the run was interrupted before there was a draw to return")
     tree = _tree(model, target, chains, request)
-    check = FilterCheck()
+    missed, check = [], FilterCheck()
     with suppress(KeyboardInterrupt):
+        missed = unvisited_warnings(tree, model, chains.seconds, rng)
         iterations = request.tune + chains.length.n_iterations
         check = check_filters(tree, model, iterations, chains.seconds, rng)
     level = "info" if progressbar else "debug"
     names = element_names(model, target.raveled.variables)
-    log_warnings([*messages_of(chains, request, names, level), *check.messages(level)])
+    messages = messages_of(chains, missed, request, names, level)
+    log_warnings([*messages, *check.messages(level)])
     warn_of_filters(check.warned)
     return tree
 
