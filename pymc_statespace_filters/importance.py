@@ -13,9 +13,7 @@ from arviz_stats import mcse
 from arviz_stats.base import array_stats
 from numpy.typing import NDArray
 from scipy.optimize import brentq
-from scipy.special import log_expit, logsumexp
-from scipy.stats import chi2
-from scipy.stats import t as student
+from scipy.special import chdtri, log_expit, logsumexp, stdtrit
 
 MIN_EFFECTIVE = 100  # effective terms below which a standard error is unreliable
 MAX_PARETO_K = 0.7  # above which it is, however many terms there are
@@ -62,9 +60,9 @@ def mcse_of_chains(terms: Array) -> float:
         return pooled
     between = float(terms.mean(axis=1).std(ddof=1)) / math.sqrt(n_chains)
     within = math.hypot(*(float(mcse(one[None], method="mean")) for one in terms)) / n_chains
-    if (n_chains - 1) * between**2 <= chi2.ppf(AGREE, n_chains - 1) * within**2:
+    if (n_chains - 1) * between**2 <= chdtri(n_chains - 1, 1 - AGREE) * within**2:
         return pooled
-    return max(pooled, between * float(student.ppf(0.975, n_chains - 1)) / 1.96)
+    return max(pooled, between * float(stdtrit(n_chains - 1, 0.975)) / 1.96)
 
 
 def disagreement(log_terms: Array) -> str:

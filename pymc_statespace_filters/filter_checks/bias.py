@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
-from scipy.stats import t as student_t
+from scipy.special import chdtri, stdtrit
 
 from ..filters.recommendation import short_form
 from .estimates import Comparison, Estimates
@@ -44,13 +43,13 @@ class _Difference(NamedTuple):
     @property
     def margin(self) -> float:
         """Half of the confidence interval of the mean."""
-        return float(student_t.ppf(1.0 - ALPHA / 2.0, max(self.n - 1, 1)) * self.se)
+        return float(stdtrit(max(self.n - 1, 1), 1.0 - ALPHA / 2.0) * self.se)
 
     @property
     def least_spread(self) -> float:
         """The lower end of an interval for the spread, as if differences were normal."""
         dof = max(self.n - 1, 1)
-        return float(self.spread * np.sqrt(dof / chi2.ppf(1.0 - ALPHA, dof)))
+        return float(self.spread * np.sqrt(dof / chdtri(dof, ALPHA)))
 
 
 def bias_at_draws(found: Comparison, points: Points, names: Sequence[str]) -> list[Finding]:
@@ -196,7 +195,7 @@ def _shifts(
         return []
     shifts = products.mean(axis=0)
     errors = products.std(axis=0, ddof=1) / np.sqrt(len(products))
-    margin = student_t.ppf(1.0 - ALPHA / (2.0 * len(names)), len(products) - 1)
+    margin = stdtrit(len(products) - 1, 1.0 - ALPHA / (2.0 * len(names)))
     return [
         _shift(name, float(shift), float(se), float(margin * se))
         for name, shift, se in zip(names, shifts, errors, strict=True)

@@ -24,9 +24,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import log_expit
-from scipy.stats import Covariance, multivariate_normal
-from scipy.stats import t as student
+from scipy.linalg import solve_triangular
+from scipy.special import log_expit, stdtrit
 
 from ..importance import (
     LogMean,
@@ -136,7 +135,7 @@ def _missed(
         points = weighted_points(tails[0], inside, evaluate, part, rng)
         found.append(max((_compared(t, draws, points, log_evidence) for t in tails), key=_errors))
     # Nested tails hold the same draws, and count as one; those not looked at do not count.
-    limit = student.isf(FALSE_ALARMS / max(len(found), 1), DEGREES_OF_FREEDOM)
+    limit = -stdtrit(DEGREES_OF_FREEDOM, FALSE_ALARMS / max(len(found), 1))
     missed = [m for m in found if m.errors > limit and m.posterior > m.draws + MIN_MISSED]
     return sorted(missed, key=_errors, reverse=True)
 
@@ -165,12 +164,18 @@ def _bridged(
     k = draws.shape[-1]
     fitted, drawn, at_drawn = draws[:, ::2].reshape(-1, k), draws[:, 1::2], log_density[:, 1::2]
     chol = np.linalg.cholesky(np.atleast_2d(np.cov(fitted, rowvar=False)))
-    q = multivariate_normal(fitted.mean(axis=0), Covariance.from_cholesky(chol))
-    x = q.rvs(count, random_state=rng).reshape(-1, k)
-    at_x = evaluate(x, rng) - q.logpdf(x)
+    centre = fitted.mean(axis=0)
+    log_constant = -float(np.log(chol.diagonal()).sum()) - 0.5 * k * math.log(2 * math.pi)
+
+    def log_normal(x: Array) -> Array:
+        z = solve_triangular(chol, (x - centre).reshape(-1, k).T, lower=True)
+        return (log_constant - 0.5 * (z**2).sum(axis=0)).reshape(x.shape[:-1])
+
+    x = centre + rng.standard_normal((count, k)) @ chol.T
+    at_x = evaluate(x, rng) - log_normal(x)
     if np.isneginf(at_x).all():
         return None
-    at_drawn = at_drawn - q.logpdf(drawn).reshape(at_drawn.shape)
+    at_drawn = at_drawn - log_normal(drawn)
     value = bridge_constant(at_drawn, at_x, 0.0)  # a rough one, of equal numbers
     of_draws = log_mean_of_chains(log_expit(value - at_drawn)).error
     of_points = log_mean_of_independent(log_expit(at_x - value)).error

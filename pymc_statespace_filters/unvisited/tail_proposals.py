@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
-from scipy.stats import genpareto
 
 from ..importance import normalised, systematic
 from ..student_mixture import StudentMixture, fit_mixture, place_components, standardised
@@ -102,14 +101,15 @@ class Extension:
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         """Independent points (count, k)."""
-        distance = genpareto.rvs(SHAPE, scale=self._scale, size=count, random_state=rng)
+        distance = self._scale * np.expm1(SHAPE * rng.standard_exponential(count)) / SHAPE
         others = self._others.sample(count, rng)
         return self._coordinates.at(np.column_stack([np.log(distance), others]))
 
     def log_density(self, x: Array) -> Array:
         """Log-density at points x (m, k), shape (m,)."""
         y, log_det = self._coordinates.of(x)
-        log_pareto = genpareto.logpdf(np.exp(y[:, 0]), SHAPE, scale=self._scale) + y[:, 0]
+        relative = np.exp(y[:, 0]) / self._scale
+        log_pareto = np.log(relative) - (1 + 1 / SHAPE) * np.log1p(SHAPE * relative)
         of_others = self._others.log_density(y[:, 1:]) if x.shape[1] > 1 else 0.0
         return np.asarray(log_pareto + of_others + log_det)
 
