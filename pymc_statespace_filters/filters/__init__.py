@@ -25,6 +25,7 @@ from .protocol import (
     RunFilter,
     StatesFilter,
     System,
+    ToleranceFilter,
 )
 from .ukf import UKF
 
@@ -50,6 +51,7 @@ __all__ = [
     "RunFilter",
     "StatesFilter",
     "System",
+    "ToleranceFilter",
     "ensemble_filter",
     "failed",
     "particle_filter",

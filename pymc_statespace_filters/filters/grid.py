@@ -44,6 +44,7 @@ from .signatures import LIKELIHOOD_OF_NOISE, PREDICTIONS, RUN, STATES
 
 # Beside a kink the error falls with the square of the spacing: 8192 points reach about 1e-6.
 _WITH_KINKS = 1e-5
+_COARSE = 1e-3  # of a term: a nat for a thousand observations, if all errors had one sign
 
 
 @dataclass(frozen=True)
@@ -145,6 +146,10 @@ class GridFilter:
     def is_exact_for(self, system: System) -> bool:
         """Whether the likelihood is that of the system, to the tolerance."""
         return system.has_exact_observation_density and system.has_smooth_transition
+
+    def coarse(self) -> "GridFilter":
+        """Return this filter with the largest tolerance that still tells where a posterior lies."""
+        return GridFilter(tolerance=max(self.tolerance, _COARSE))
 
     def compile(self, system: System) -> PlannedFunction:
         """Compile the log-likelihood."""

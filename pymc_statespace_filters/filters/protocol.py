@@ -3,8 +3,8 @@
 A filter is an immutable, hashable object that holds settings. It states which systems it supports
 and compiles functions for one system, which it is given as a `System`. No base class is needed:
 `log_likelihood`, `StateSpace`, `sample_dram` and the evidence take any `Filter`. Its other
-abilities are the methods of `RunFilter`, `StatesFilter`, `BatchFilter`, `DifferentiableFilter` and
-`EnsembleFilter`.
+abilities are the methods of `RunFilter`, `StatesFilter`, `BatchFilter`, `DifferentiableFilter`,
+`EnsembleFilter` and `ToleranceFilter`.
 
 Arguments and results of the compiled functions are those of `filters.signatures`. Their arrays:
 ``theta`` (k,) parameters; ``steps`` (J,) int64, the step of each observation; ``observed`` (J, p),
@@ -144,6 +144,14 @@ class EnsembleFilter(Filter, Protocol):
 
     def stored_noise(self, system: System) -> PlannedFunction:
         """Compile the making of these normals: (steps, seed) -> one vector."""
+
+
+@runtime_checkable
+class ToleranceFilter(Filter, Protocol):
+    """A filter whose error is bounded by a tolerance, and that takes longer the smaller it is."""
+
+    def coarse(self) -> Filter:
+        """Return this filter with the largest tolerance that still tells where a posterior lies."""
 
 
 class Properties(NamedTuple):

@@ -16,8 +16,7 @@ from pytensor.tensor.variable import TensorVariable
 from ..compiler.lowering.compiled_system import compile_system
 from ..errors import ModelError
 from ..filters.ekf import EKF
-from ..filters.grid import GridFilter
-from ..filters.protocol import EnsembleFilter, Filter
+from ..filters.protocol import EnsembleFilter, Filter, ToleranceFilter
 from ..filters.recommendation import check_system_and_filter
 from ..filters.signatures import PANEL
 from ..ops.distributed import CallbackLogLikelihood, CallbackLogLikelihoodOfNoise
@@ -205,7 +204,14 @@ def smooth_filters(model: pm.Model) -> dict[str, Filter]:
 def expensive_variables(model: pm.Model) -> list[str]:
     """Names of the variables whose filter takes milliseconds: particles, members or a grid."""
     filters = {name: node.op.filter for name, node in state_space_nodes(model).items()}
-    return [name for name, one in filters.items() if one.noisy or isinstance(one, GridFilter)]
+    return [name for name, one in filters.items() if one.noisy or isinstance(one, ToleranceFilter)]
+
+
+def coarse_filters(model: pm.Model) -> dict[str, Filter]:
+    """The coarse forms of the filters that have one and are not coarse, by names."""
+    filters = {name: node.op.filter for name, node in state_space_nodes(model).items()}
+    coarse = {n: f.coarse() for n, f in filters.items() if isinstance(f, ToleranceFilter)}
+    return {name: filter for name, filter in coarse.items() if filter != filters[name]}
 
 
 def pilot_filters(model: pm.Model) -> dict[str, Filter]:

@@ -14,6 +14,8 @@ from pymc_statespace_filters.compiler.native.rows import Rows
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.outcomes import Failure, why_zero
 from pymc_statespace_filters.pymc_model.graph_rewrites import expensive_variables
+from pymc_statespace_filters.sampling.starts.population import population_of
+from pymc_statespace_filters.sampling.target.log_density import LogDensity
 from pymc_statespace_filters.sampling.target.target import Target
 from tests.systems import autoregression, simulated
 
@@ -111,6 +113,53 @@ def test_noisy_likelihoods_and_seeds():
     (first,), (again,), (other,) = (starts_of(model, 1, seed) for seed in (1, 1, 2))
     assert first == again
     assert first != other
+
+
+def _seen_by(filter):
+    """Twenty rows of a linear-Gaussian state with an unknown persistence."""
+    with pm.Model() as model:
+        pm.Normal("phi", 0.5, 1.0)
+        observed = simulated(range(20), 1, phi=0.7, spread=1.0)
+        params = {"spread": 1.0}
+        psf.StateSpace(
+            "d", autoregression(), filter, steps=range(20), observed=observed, params=params
+        )
+    return model
+
+
+def test_a_grid_evaluates_only_what_its_coarse_form_has_found(monkeypatch):
+    evaluated = Counter()
+    call = Rows.__call__
+
+    def counting(rows, x, *others):
+        evaluated[rows] += len(x)
+        return call(rows, x, *others)
+
+    monkeypatch.setattr(Rows, "__call__", counting)
+    rng = np.random.default_rng(1)
+    found, _ = population_of(_seen_by(psf.GridFilter()), rng, progressbar=False)
+    *others, last = evaluated.values()
+    assert last == len(found.x) < sum(others) / 4
+    exact = _seen_by(psf.EKF())  # Kalman's
+    log_density = exact.compile_logp()
+    expected = [log_density({"phi": x[0]}) for x in found.x[:20]]
+    np.testing.assert_allclose(found.log_density[:20], expected, rtol=0, atol=20 * 1e-8)
+
+
+@pytest.mark.parametrize("least", [0.0, 100.0])
+def test_starts_have_a_positive_likelihood_where_the_coarse_one_has_too_many(monkeypatch, least):
+    def coarse_density(target):
+        return LogDensity(*target._shared, graph=target._model.logp(vars=target._model.free_RVs))
+
+    monkeypatch.setattr(Target, "coarse_density", coarse_density)
+    with pm.Model() as model:
+        x = pm.Normal("x", 0, 1)
+        pm.Potential("truncated", pt.switch(x > least, 0.0, -np.inf))
+    if least == 100.0:
+        with pytest.raises(ModelError, match="zero at all of 2000 draws"):
+            starts_of(model)
+    else:
+        assert all(start["x"] > least for start in starts_of(model, 64))
 
 
 def test_models_without_a_proper_prior_or_a_positive_likelihood_are_refused():

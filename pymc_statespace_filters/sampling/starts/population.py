@@ -6,6 +6,10 @@ square root of its likelihood, and from there to the posterior, which takes fewe
 square root, because the two likelihoods may differ by many nats. Draws of some variables from a
 pilot, if there are any, lead the way instead (`nested_reference`).
 
+A filter with a tolerance may be tens of times slower at draws of the prior than in the posterior.
+The points are therefore found with its coarse form, whose posterior is nearly the same, and the
+filter itself evaluates only those that have been found.
+
 In many dimensions the moves of the annealing are too few. The population then settles by moves
 along the gradient, if there is one (`langevin`).
 
@@ -14,6 +18,7 @@ cost little, and an expensive filter evaluates some of them.
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +32,7 @@ from ...pymc_model.prior import can_sample
 from ...student_mixture import StudentMixture, fit_mixture, place_components, standardised
 from ..kernel.state import draw_seeds
 from ..target.initial_points import N_DRAWS
+from ..target.log_density import LogDensity
 from ..target.settings import RandomWalkSettings
 from ..target.target import Target
 from ..target.variables import RaveledVariables
@@ -93,8 +99,38 @@ def find_population(
     ModelError
         If no draw of the prior has a positive likelihood.
     """
-    led = _led_by_ekf(target, rng, progressbar=progressbar) if pilot is None else None
+    search = partial(_search, target, rng, progressbar=progressbar, n_points=n_points, pilot=pilot)
+    if (coarse := target.coarse_density()) is not None:
+        found = _evaluated(target, search(coarse), rng, progressbar=progressbar)
+        if len(found.x):
+            return found
+    return search(target.density)
+
+
+def _evaluated(
+    target: Target, found: Points, rng: np.random.Generator, *, progressbar: bool
+) -> Points:
+    """The points of positive likelihood among those found with coarse filters."""
     rows = target.density.at_rows()
+    with row_progress(rows, enabled=progressbar) as announce:
+        announce("Evaluating the starts", len(found.x))
+        log_density = _densities(rows, target, rng)(found.x)[1]
+    index = np.flatnonzero(log_density > -np.inf)
+    return Points(found.x[index], log_density[index], found.mode[index])
+
+
+def _search(
+    target: Target,
+    rng: np.random.Generator,
+    density: LogDensity,
+    *,
+    progressbar: bool,
+    n_points: int,
+    pilot: Array | None,
+) -> Points:
+    """Points distributed nearly as a log-density, that of the target or a coarse one."""
+    led = _led_by_ekf(target, rng, progressbar=progressbar) if pilot is None else None
+    rows = density.at_rows()
     with row_progress(rows, enabled=progressbar) as announce:
         announce("Finding starts", _TYPICAL_EVALUATIONS * n_points)
         full = _densities(rows, target, rng)
@@ -111,7 +147,7 @@ def find_population(
             drawn = _prior_population(target, _from_prior(full), n_points)
             found = _annealed(drawn, n_points, rng, fewest=1)
         if found is None:
-            raise ModelError(_nowhere(target, rows, drawn[0].x, rng))
+            raise ModelError(_nowhere(target, density, drawn[0].x, rng))
         x, log_density = found.x, found.log_first + found.log_ratio
     if settled := _settled(target, x, rng, of_pilot=False, progressbar=progressbar):
         x, log_density = settled
@@ -164,13 +200,13 @@ def _settled(
         return settle(last, evaluate, rng)
 
 
-def _nowhere(target: Target, rows: Rows, x: Array, rng: np.random.Generator) -> str:
+def _nowhere(target: Target, density: LogDensity, x: Array, rng: np.random.Generator) -> str:
     """Say that no draw of the prior has a positive likelihood, why, and what to do."""
     explained = x[:N_DRAWS]
-    failures = target.density.failures(rows(explained, *_seeds(target, len(explained), rng).T))
+    results = density.at_rows()(explained, *_seeds(target, len(explained), rng).T)
     return (
         f"the likelihood is zero at all of {len(x)} draws of the prior: "
-        f"{why_zero(failures, len(explained))}"
+        f"{why_zero(density.failures(results), len(explained))}"
     )
 
 

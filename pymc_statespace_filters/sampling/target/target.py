@@ -17,7 +17,7 @@ from ...compiler.native.rows import Rows
 from ...errors import GradientUnavailableError, ModelError
 from ...parallel.communicator import Communicator
 from ...parallel.signals import held_interrupts
-from ...pymc_model.graph_rewrites import expensive_variables, pilot_filters
+from ...pymc_model.graph_rewrites import coarse_filters, expensive_variables, pilot_filters
 from ...pymc_model.inspection import state_space_nodes
 from ..kernel.state import ChainState, RandomBlock, random_block
 from ..kernel.transition import evaluate
@@ -92,6 +92,15 @@ class Target(SampledModel):
     def is_expensive(self) -> bool:
         """Whether an evaluation takes milliseconds, not microseconds."""
         return bool(expensive_variables(self._model))
+
+    def coarse_density(self) -> LogDensity | None:
+        """The log-density with coarse filters, if there are any; noise as in ``density``."""
+        filters = coarse_filters(self._model)
+        if not filters:
+            return None
+        graph = tempered_density(self._model, filters, 1.0)
+        fixed_noise = not self.settings.refresh_noise
+        return LogDensity(*self._shared, fixed_noise=fixed_noise, graph=graph)
 
     def pilot_density(self) -> LogDensity | None:
         """Prior times the square root of an `EKF`'s likelihood, if the filters are expensive."""
