@@ -372,6 +372,11 @@ def test_tails_that_a_surprise_asks_for_were_not_cut_off_before():
         np.testing.assert_allclose(grid_terms(system, data, steps), expected, rtol=1e-9)
 
 
+def test_the_coarse_form_is_not_finer_than_the_filter():
+    assert psf.GridFilter().coarse() == psf.GridFilter(tolerance=1e-3)
+    assert psf.GridFilter(tolerance=1e-2).coarse() == psf.GridFilter(tolerance=1e-2)
+
+
 def test_a_sensor_with_a_kink_has_a_tolerance_that_the_largest_grid_allows():
     """Beside the kink of |x| the trapezoidal rule is of second order: 1e-8 would need 10^5 points.
 
