@@ -165,7 +165,7 @@ def test_chains_below_what_the_search_has_met_never_reached_the_posterior(report
     set_population = model_task.ModelTask.set_population
 
     def higher(task, found):
-        set_population(task, found._replace(highest=found.highest + 100.0))
+        set_population(task, found._replace(level=found.level + 100.0))
 
     monkeypatch.setattr(model_task.ModelTask, "set_population", higher)
     _, _, messages = report_of(simple_model(), draws=50, tune=400)

@@ -68,11 +68,11 @@ def needed(found: Convergence, enough: float, n_iterations: int, seconds: float)
 
 
 def below_known_warning(nats: float) -> SamplerWarning:
-    """Warn of chains far below a point that the search for starts has met."""
+    """Warn of chains far below the points that the search for starts has found."""
     return sampler_warning(
         f"The chains never reached the posterior: their median log-density stayed {nats:.0f} nats "
-        "or more below that of points which the search for starts has found. Tune longer, or start "
-        "there (initvals=psf.find_starts())."
+        "or more below that of the points which the search for starts has found. Tune longer, or "
+        "start there (initvals=psf.find_starts())."
     )
 
 

@@ -181,19 +181,20 @@ def lower_chains_of(chains: Sequence[Draws], tune: int) -> list[LowerChain]:
     return lower_chains(log_densities, chains[0].positions.shape[1])
 
 
-def below_known(highest: float, chains: Sequence[Draws], tune: int) -> float | None:
-    """By how many nats all chains stayed below a log-density that is known; None if they did not.
+def below_known(known: float, chains: Sequence[Draws], tune: int) -> float | None:
+    """By how many nats all chains stayed below a known level; None if they did not.
 
-    A point of the posterior of d parameters lies some d / 2 nats below the highest one.
+    All levels are medians of log-densities: a few points may lie high and hold no mass, as in the
+    neck of a funnel.
     """
     levels = [
         float(np.median(draws.numbers[tune:, LOG_DENSITY]))
         for draws in chains
         if len(draws.positions) > tune
     ]
-    if not levels or not math.isfinite(highest):
+    if not levels or not math.isfinite(known):
         return None
-    nats = highest - max(levels)
+    nats = known - max(levels)
     return nats if nats > TOLERATED + chains[0].positions.shape[1] else None
 
 

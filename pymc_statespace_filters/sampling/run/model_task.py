@@ -92,7 +92,7 @@ class ModelTask:
         self._group = group
         self.checkpoint: Checkpoint | None = None
         self.population: np.ndarray | None = None
-        self._highest = -np.inf  # log-density that the search for starts has met
+        self._level = -np.inf  # median log-density of the points of the search for starts
         self._given = target
         self._target: Target | RecordTarget | None = None
         self.n_iterations = stops_of(request)[0]  # after which the chains end, for now
@@ -232,7 +232,7 @@ class ModelTask:
     def set_population(self, found: SearchedPoints | None) -> None:
         """Set what the search for starts has found."""
         if found is not None:
-            self.population, self._highest = found
+            self.population, self._level = found
 
     def set_length(self, length: Length) -> None:
         """Set the length after which chains end, before any has begun."""
@@ -437,11 +437,11 @@ class ModelTask:
     def _unreached_warnings(
         self, target: Target | RecordTarget, chains: Sequence[Draws]
     ) -> list[SamplerWarning]:
-        """Warn if all chains stayed far below points that the search for starts has met.
+        """Warn if all chains stayed far below the points that the search for starts has found.
 
         An estimate may be far too high by chance, so that this says nothing of one with noise.
         """
-        nats = below_known(self._highest, chains, self.request.tune)
+        nats = below_known(self._level, chains, self.request.tune)
         return [] if nats is None or target.seed_names else [below_known_warning(nats)]
 
     def _measure_noise(

@@ -96,10 +96,10 @@ class WarmUp:
 
 
 class SearchedPoints(NamedTuple):
-    """Points of the posterior (m, d), and the highest log-density among them, if it is known."""
+    """Points of the posterior (m, d), and their median log-density, if it is known."""
 
     x: np.ndarray
-    highest: float = -np.inf
+    level: float = -np.inf
 
 
 def search_population(
@@ -136,7 +136,7 @@ def search_population(
         return None
     journal = None if checkpoint is None else checkpoint.journal("starts")
     if journal is not None and (stored := journal.read()) is not None:
-        return SearchedPoints(stored.draws["population"], float(stored.state["highest"]))
+        return SearchedPoints(stored.draws["population"], float(stored.state["level"]))
     try:
         found = find_population(
             target,
@@ -150,10 +150,10 @@ def search_population(
         raise
     if (message := modes_message(model, target.raveled, found)) is not None:
         log_warnings([modes_warning(said(message))])
-    highest = float(found.log_density.max())
+    level = float(np.median(found.log_density))
     if journal is not None:
-        journal.append({"population": found.x}, {"highest": np.array(highest)})
-    return SearchedPoints(found.x, highest)
+        journal.append({"population": found.x}, {"level": np.array(level)})
+    return SearchedPoints(found.x, level)
 
 
 def n_search_points(request: SamplingRequest, target: Target) -> int:
