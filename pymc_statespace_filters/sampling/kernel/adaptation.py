@@ -16,8 +16,9 @@ Differences from the sources
     * "Earlier iterations" are the last block for the first two blocks and from then on the latest
       half to three quarters of the warm-up, so that a bad start is forgotten and yet a covariance
       is not estimated from one block alone, which is poor once d is more than a few.
-    * A covariance from few accepted moves is averaged with the covariance in use before, which
-      counts as d^2 moves. So a direction not explored yet keeps a proposal of sensible size.
+    * A covariance from few accepted moves is averaged with the covariance in use before. So a
+      direction not explored yet keeps a proposal of sensible size. That covariance counts as d^2
+      moves if its proposals are accepted, as those of a population's are, else as d/5.
     * The scale is reduced in steps: to a fifth after a block that accepts almost nothing, to a half
       if the first stage accepts less than 5 %; it is 1 again once more than 10 % is accepted.
       Between the two lies the acceptance at which pseudo-marginal chains work best.
@@ -61,8 +62,9 @@ LOW_ACCEPTANCE, FAIR_ACCEPTANCE = 0.05, 0.10
 STALLED, SHRINK = 0.2, 0.5
 # Stalls in a row that reduce the scale; the next one resets the adaptation.
 MOST_STALLS = 6
-# Weight of the covariance in use before, in accepted moves for each of its elements.
-PRIOR_MOVES = 1.0
+# Weight of the covariance in use before, in accepted moves: for each of its elements if its
+# proposals have a fair acceptance, else for each dimension.
+FAIR_MOVES, LOW_MOVES = 1.0, 0.2
 # The multiple of the identity, relative to the mean variance.
 JITTER = 1e-8
 
@@ -224,7 +226,8 @@ def _learn_covariance(state: AdaptationState) -> None:
         _merge(moments, state.block)
     n, moved, base = moments.counts[N], moments.counts[MOVED], state.base
     dim = base.shape[0]
-    weight = moved / (moved + PRIOR_MOVES * dim**2)
+    is_fair = moments.counts[FIRST] > FAIR_ACCEPTANCE * moments.counts[WALKED]
+    weight = moved / (moved + (FAIR_MOVES * dim**2 if is_fair else LOW_MOVES * dim))
     factor = weight * (2.38 * state.numbers[SCALE]) ** 2 / (dim * n)
     cov, mean_variance = np.empty((dim, dim)), 0.0
     for i in range(dim):
