@@ -4,6 +4,7 @@ import difflib
 import warnings
 from collections.abc import Iterator
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import pymc as pm
 from pytensor.graph.traversal import ancestors
@@ -17,15 +18,21 @@ from .inspection import state_space_nodes
 
 # Of the similarity of two names from 0 to 1: "beta" and "b" have 0.4.
 _SIMILAR = 0.35
+# Names of which a model has been told: it is compiled several times in one run.
+_told: WeakKeyDictionary[pm.Model, set[str]] = WeakKeyDictionary()
 
 
 def warn_of_unused_priors(model: pm.Model) -> None:
-    """Warn of free variables whose posterior is their prior; of those in Deterministics do not."""
+    """Warn once of each free variable whose posterior is its prior, but not of a Deterministic's."""
     nodes = state_space_nodes(model)
     fixed = {
         name: label for label, node in nodes.items() for name in _constant_parameters(model, node)
     }
+    told = _told.setdefault(model, set())
     for name in _unused_priors(model, nodes):
+        if name in told:
+            continue
+        told.add(name)
         warnings.warn(
             f"the prior of {name!r} reaches no likelihood, so its posterior is the prior"
             + _probable_cause(name, fixed),

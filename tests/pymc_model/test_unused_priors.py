@@ -28,6 +28,8 @@ def test_a_misspelt_prior_is_named_with_the_default_that_is_used_instead():
     said = r"prior of 'beta' reaches no likelihood.*parameter 'b' of 'd' is fixed.*'b': beta"
     with pytest.warns(ModelWarning, match=said):
         SampledModel(model, None, RandomWalkSettings())
+    SampledModel(model, None, RandomWalkSettings())  # a model is told once
+    model = model_with(lambda: pm.Normal("beta"))
     with model, pytest.warns(ModelWarning, match=said):  # as a sampler of PyMC asks
         found = model.logp(vars=[model["d"]])
     at = {model.rvs_to_values[model["a"]]: 0.5}
