@@ -74,10 +74,12 @@ class StateSpace(Continuous):
         count days.
     input_times : array_like, shape (rows,), optional
         Times of the rows of ``inputs``, numbers or dates, if they have their own; of a panel, as
-        ``inputs``, one array for all records or one for each.
+        ``inputs``, one array for all records or one for each. The index of ``inputs`` if it holds
+        dates and the record has times.
     inputs_at : {"hold", "linear"}
         What inputs with times of their own are between these: the last value, or linear, of which a
-        step takes the value in its middle. A value that changes within a step ends the step there.
+        step takes the value in its middle, or at its beginning if the observation, its noise
+        included, has the argument u. A held value that changes within a step ends the step there.
     seed : int
         Seed of the noise inside the filter; in a panel, the noise of each record depends on it and
         on the record's label. The model stores it as shared data ``{name}_seed``,

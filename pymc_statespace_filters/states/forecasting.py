@@ -18,7 +18,7 @@ from ..system.panel import of_each_record
 from ..system.placement import check_takes
 from ..system.steps import GRID_TOLERANCE, check_steps
 from ..system.time_axis import TimeAxis, TimesBetween, axis_of, check_increasing, is_grid
-from ..system.timed_inputs import check_inputs_at, timed_inputs
+from ..system.timed_inputs import check_inputs_at, timed_inputs, times_of_inputs
 from .draws import select_draws
 from .groups import add_group, join_rows, row_coords, state_dims
 from .record import Array, RecordAtDraws
@@ -115,7 +115,7 @@ def forecast(
             _future_axis(n_steps, steps, times, record, changes)
             for record, (_, changes) in zip(at_draws.records, timed, strict=True)
         ]
-        if input_times is not None:
+        if timed[0][0] is not None:
             pairs = zip(timed, axes, at_draws.records, strict=True)
             inputs = [one.rows(axis, variable.clock, r.number) for (one, _), axis, r in pairs]
             inputs = inputs if variable.is_panel else inputs[0]
@@ -164,18 +164,18 @@ def _timed_inputs(
     """The inputs of each record if they have times of their own, and when they change."""
     check_inputs_at(inputs_at)
     records, variable = at_draws.records, at_draws.variable
-    if input_times is None:
-        return [(None, np.empty(0))] * len(records)
     labels = [record.label for record in records]
-    names, clock = variable.system.inputs, variable.clock
+    own_inputs, own_times = of_each_record("inputs", inputs, labels), None
+    if input_times is not None:
+        own_times = of_each_record("input_times", input_times, labels)
+    if variable.clock.unit is not None:
+        own_times = times_of_inputs(own_inputs, own_times)
+    if own_times is None:
+        return [(None, np.empty(0))] * len(records)
+    system, clock = variable.system, variable.clock
     found = [
-        timed_inputs(own, times, inputs_at, names, clock, record.number)
-        for own, times, record in zip(
-            of_each_record("inputs", inputs, labels),
-            of_each_record("input_times", input_times, labels),
-            records,
-            strict=True,
-        )
+        timed_inputs(own, times, inputs_at, system, clock, record.number)
+        for own, times, record in zip(own_inputs, own_times, records, strict=True)
     ]
     return [(one, one.changes()) for one in found]
 

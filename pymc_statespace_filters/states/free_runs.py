@@ -20,7 +20,7 @@ from ..system.model import StateSpaceModel
 from ..system.panel import of_each_record
 from ..system.placement import Placement, Timing, place_by
 from ..system.record import check_inputs, check_observed
-from ..system.timed_inputs import check_inputs_at
+from ..system.timed_inputs import check_inputs_at, times_of_inputs
 from .draws import SAMPLE_DIMS, select_draws
 from .groups import add_group, by_record, join_rows, row_coords, state_dims
 from .record import Array, RecordAtDraws, simulate_observations
@@ -216,12 +216,18 @@ def _placed(
     check_inputs_at(inputs_at)
     labels = [record.label for record in records]
     own_inputs = of_each_record("inputs", inputs, labels)
-    own_times = of_each_record("input_times", input_times, labels)
+    own_times: Any = None
+    if input_times is not None:
+        own_times = of_each_record("input_times", input_times, labels)
+    if variable.clock.unit is not None:
+        own_times = times_of_inputs(own_inputs, own_times)
     found = []
-    for record, rows, row_times in zip(records, own_inputs, own_times, strict=True):
+    for record, rows, row_times in zip(
+        records, own_inputs, own_times or [None] * len(records), strict=True
+    ):
         system, at = variable.system, steps
         if steps is None and times is None:
-            if input_times is None:
+            if row_times is None:
                 found.append(Placement(system, variable.clock, [record.axis], [rows]))
                 continue
             if system.is_at_any_times:

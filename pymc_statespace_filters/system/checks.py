@@ -5,6 +5,7 @@ from numbers import Integral, Real
 from typing import Any, TypeGuard
 
 import numpy as np
+import pandas as pd
 
 from ..errors import ModelError
 
@@ -70,6 +71,8 @@ def check_floats(name: str, value: Any, ndim: int | None, *, missing: bool = Fal
     if np.ma.isMaskedArray(value):
         value = np.ma.filled(np.ma.asarray(value, dtype="float64"), np.nan)
     try:
+        if (objects := np.asarray(value)).dtype.kind == "O":
+            value = np.where(pd.isna(objects), np.nan, objects)  # NA of pandas is no float
         # By rows, as compiled code reads it: the numbers of a DataFrame are stored by columns.
         array = np.array(value, dtype="float64", order="C")
     except (TypeError, ValueError):

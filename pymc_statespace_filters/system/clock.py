@@ -1,7 +1,7 @@
 """The user's times as numbers of the model, and back: numbers as they are, or dates."""
 
 import datetime
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,6 +66,8 @@ def clock_and_start(
         if are_dates(t0):
             raise ModelError(f"t0 must be a number where {name} are numbers, got {t0!r}")
         return Clock(), check_finite("t0", t0)
+    if isinstance(t0, str):
+        raise ModelError(f"t0 must be a number or a date, got text: write pd.Timestamp({t0!r})")
     if unit is None:
         raise ModelError(
             f"unit must be the duration of one unit of model time where {name} are dates, such as "
@@ -119,6 +121,18 @@ def times_of_data(observed: Any) -> Any:
     return None
 
 
+def check_zones(dates: Mapping[str, Any]) -> None:
+    """Raise unless all dates, by the names of their arguments, have a time zone or none has."""
+    zones = {name: _index(name, own).tz is not None for name, own in dates.items()}
+    if len(set(zones.values())) > 1:
+        aware = [name for name, has_zone in zones.items() if has_zone]
+        naive = [name for name, has_zone in zones.items() if not has_zone]
+        raise ModelError(
+            f"{' and '.join(naive)} must have a time zone, as {' and '.join(aware)}, or none of "
+            f"them: write .tz_localize(zone), got {shortened(dates[naive[0]])}"
+        )
+
+
 def numbers_of_time(name: str, times: Any) -> np.ndarray:
     """Times as floats; text and durations are refused."""
     array = np.asarray(times)
@@ -145,12 +159,18 @@ def _since(origin: int, dates: np.ndarray, unit: int) -> np.ndarray:
 
 def _nanoseconds(name: str, dates: Any) -> np.ndarray:
     """Dates as nanoseconds since 1970; with a time zone, in UTC."""
-    try:
-        index = pd.DatetimeIndex(np.asarray(dates) if hasattr(dates, "dims") else dates)
-        index = index if index.tz is None else index.tz_convert("UTC").tz_localize(None)
-        array = index.as_unit("ns").asi8
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ModelError(f"{name} must be dates from 1678 to 2261, got {error}") from None
+    index = _index(name, dates)
     if (missing := np.flatnonzero(index.isna())).size:
         raise ModelError(f"{name} must hold a date in every row, got none in row {missing[0]}")
-    return np.asarray(array)
+    index = index if index.tz is None else index.tz_convert("UTC").tz_localize(None)
+    return np.asarray(index.asi8)
+
+
+def _index(name: str, dates: Any) -> pd.DatetimeIndex:
+    dates = [dates] if np.ndim(dates) == 0 else dates
+    try:
+        return pd.DatetimeIndex(np.asarray(dates) if hasattr(dates, "dims") else dates).as_unit(
+            "ns"
+        )
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ModelError(f"{name} must be dates from 1678 to 2261, got {error}") from None

@@ -182,6 +182,7 @@ class StateSpaceModel:
             observation_uses_inputs=any(
                 from_inputs.intersection(e.symbols) for e in functions.observation.equations
             ),
+            observation_has_u=any("u" in e.symbols for e in functions.observation.equations),
             keeps_noises=False,
             equations=equations,
         )
@@ -209,6 +210,7 @@ class StateSpaceModel:
     discrete_noise: bool
     gaussian_observation: bool
     observation_uses_inputs: bool
+    observation_has_u: bool
     keeps_noises: bool
     equations: Equations
 

@@ -51,7 +51,8 @@ def _own_inputs(inputs: Any, labels: Sequence[Any], name: str = "inputs") -> lis
             )
         return [inputs[label] for label in labels]
     is_list = isinstance(inputs, list | tuple) and all(
-        isinstance(part, np.ndarray | Variable | pd.DataFrame | xr.DataArray) and part.ndim
+        isinstance(part, np.ndarray | Variable | pd.Series | pd.DataFrame | xr.DataArray)
+        and part.ndim
         for part in inputs
     )
     if not is_list and not (isinstance(inputs, np.ndarray) and inputs.ndim == 3):
@@ -216,7 +217,7 @@ def checked_panel(
         data = np.full((int(records.starts[-1]), system.p), np.nan)
     else:
         data = _check_observed(observed, system, records)
-    rows_of_user = inputs if input_times is None else placed.inputs
+    rows_of_user = placed.inputs if placed.has_timed_inputs else inputs
     forces, first_inputs = panel_inputs(rows_of_user, placed.system, records, placed.axes)
     number, at = records.of_rows(), np.concatenate([axis.steps for axis in placed.axes])
     begin = np.zeros_like(at) if first_inputs is None else first_inputs[number]
@@ -241,9 +242,8 @@ def _placed(
         raise ModelError("give exactly one of steps and times")
     if isinstance(times, Variable):
         raise ModelError("times must be numbers, got a symbol; give steps=pm.Data(...) instead")
-    own_inputs, own_times = [inputs] * len(records.labels), None
+    own_inputs, own_times = of_each_record("inputs", inputs, records.labels), None
     if input_times is not None:
-        own_inputs = of_each_record("inputs", inputs, records.labels)
         own_times = of_each_record("input_times", input_times, records.labels)
         if any(isinstance(part, Variable) for part in own_inputs):
             raise ModelError("inputs must be numbers where input_times are given, got a symbol")
@@ -293,7 +293,7 @@ def symbolic_panel(
             "panel and steps must be numbers for a system with accumulators, which are reset at the"
             " steps of each record, and at times off the grid, got pm.Data"
         )
-    rows_of_user = inputs if input_times is None else placed.inputs
+    rows_of_user = placed.inputs if placed.has_timed_inputs else inputs
     forces, first_inputs = symbolic_panel_inputs(rows_of_user, system, records, axes)
     if isinstance(panel, Variable):
         codes: Any = pt.cast(panel, "int64")

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import ModelError
-from .clock import Clock, clock_and_start
+from .clock import Clock, are_dates, check_zones, clock_and_start
 from .model import StateSpaceModel
 from .steps import GRID_TOLERANCE, check_steps
 from .time_axis import (
@@ -18,7 +18,7 @@ from .time_axis import (
     is_grid,
     off_grid,
 )
-from .timed_inputs import check_inputs_at, timed_inputs
+from .timed_inputs import check_inputs_at, timed_inputs, times_of_inputs
 
 
 class Earlier(NamedTuple):
@@ -53,7 +53,8 @@ class Earlier(NamedTuple):
 class Timing(NamedTuple):
     """What a user says of the times of some records; of a list, an entry for each record.
 
-    ``steps`` or ``times`` is None; ``input_times`` is None for inputs by step.
+    ``steps`` or ``times`` is None; ``input_times`` is None for inputs by step, and for those
+    whose index holds their dates.
     """
 
     steps: list[Any] | None
@@ -69,13 +70,15 @@ class Timing(NamedTuple):
 class Placement(NamedTuple):
     """The axis of each record, and its inputs by step, as the user gave them or from their times.
 
-    ``system`` is the one at any times where an axis is not a grid.
+    ``system`` is the one at any times where an axis is not a grid; ``has_timed_inputs`` says
+    whether the inputs had times.
     """
 
     system: StateSpaceModel
     clock: Clock
     axes: list[TimeAxis]
     inputs: list[Any]
+    has_timed_inputs: bool = False
 
 
 def _one_by_one(check: Callable[..., Any], *parts: Sequence[Any]) -> list[Any]:
@@ -89,11 +92,22 @@ def place(
     check_inputs_at(timing.inputs_at)
     if (timing.steps is None) == (timing.times is None):
         raise ModelError("give exactly one of steps and times")
+    check_zones(_dates(timing))
     if timing.earlier is None or timing.earlier.clock.unit is None:
         clock, t0 = clock_and_start(timing.times, timing.t0, timing.unit)
     else:
         clock, t0 = timing.earlier.clock, timing.earlier.t0
     return place_by(clock, t0, system, timing, range(len(timing.inputs)), check_each)
+
+
+def _dates(timing: Timing) -> dict[str, Any]:
+    """What of a timing holds dates, by the name of its argument; of records, those of the first."""
+    firsts = {
+        "times": timing.times and timing.times[0],
+        "t0": timing.t0,
+        "input_times": (times := times_of_inputs(timing.inputs, timing.input_times)) and times[0],
+    }
+    return {name: value for name, value in firsts.items() if are_dates(value)}
 
 
 def place_by(
@@ -105,13 +119,15 @@ def place_by(
     check_each: Callable[..., list[Any]] = _one_by_one,
 ) -> Placement:
     """The same by a clock that is known, for the records of these numbers."""
-    timed = None
-    if timing.input_times is not None:
+    timed, input_times = None, timing.input_times
+    if timing.steps is None or clock.unit is not None:
+        input_times = times_of_inputs(timing.inputs, input_times)
+    if input_times is not None:
         timed = check_each(
             lambda g, inputs, times: timed_inputs(
-                inputs, times, timing.inputs_at, system.inputs, clock, g
+                inputs, times, timing.inputs_at, system, clock, g
             ),
-            numbers, timing.inputs, timing.input_times,
+            numbers, timing.inputs, input_times,
         )  # fmt: skip
     changes = [np.empty(0)] * len(numbers) if timed is None else [one.changes() for one in timed]
     if timing.steps is not None:
@@ -122,7 +138,9 @@ def place_by(
         ]
     else:
         assert timing.times is not None
-        times = check_each(lambda g, own: _increasing(own, clock, g), numbers, timing.times)
+        times = check_each(
+            lambda g, own: _times_from(t0, own, system.dt, clock, g), numbers, timing.times
+        )
         given = [
             TimesBetween(None, own, t0, breaks) for own, breaks in zip(times, changes, strict=True)
         ]
@@ -138,15 +156,27 @@ def place_by(
     if timed is None:
         return Placement(system, clock, axes, timing.inputs)
     rows = check_each(lambda g, one, axis: one.rows(axis, clock, g), numbers, timed, axes)
-    return Placement(system, clock, axes, rows)
+    return Placement(system, clock, axes, rows, has_timed_inputs=True)
 
 
-def _increasing(given: Any, clock: Clock, record: int) -> np.ndarray:
+def _times_from(t0: float, given: Any, dt: float, clock: Clock, record: int) -> np.ndarray:
+    """Times as numbers, which increase from t0 on."""
     times = clock.numbers("times", given, record)
     if times.size == 0:
         raise ModelError("times must hold at least one time, got none")
     check_increasing("times", times, lambda time: clock.shown(time, record))
+    if times[0] < t0 - GRID_TOLERANCE * dt:
+        start, first = clock.shown([t0, times[0]], record)
+        raise ModelError(
+            f"times must not lie before t0 = {_text(start)}, where the initial state holds, got "
+            f"times[0] = {_text(first)}"
+        )
     return times
+
+
+def _text(time: Any) -> str:
+    """A time as a user reads it, a number or a date."""
+    return str(time) if isinstance(time, np.datetime64) else f"{time:.15g}"
 
 
 def _until_the_end(given: TimesBetween) -> TimesBetween:
@@ -164,10 +194,9 @@ def check_takes(system: StateSpaceModel, given: TimesBetween, clock: Clock, reco
         if (off > GRID_TOLERANCE).any():
             at = int(np.argmax(off))
             value = clock.shown(times, record)[at]
-            number = f"{value:.15g}" if clock.unit is None else str(value)
             what = f"times[{at}] =" if name == "times" else "the change of the inputs at"
             raise ModelError(
-                f"{what} {number} is off the grid t0 + k*dt with t0 = {given.t0:g} and dt = "
+                f"{what} {_text(value)} is off the grid t0 + k*dt with t0 = {given.t0:g} and dt = "
                 f"{system.dt:g} by {off[at]:.3g} steps, and {system.why_one_length}; round with "
                 "psf.nearest_steps(times, dt, t0=t0)"
             )

@@ -6,6 +6,7 @@
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 import pytensor.tensor as pt
 from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Variable
@@ -57,8 +58,7 @@ def checked_record(
     earlier: Earlier | None = None,
 ) -> CheckedRecord:
     """Check every part of a record of numbers; ``observed`` is None for a simulation."""
-    if steps is None and times is None:
-        times = times_of_data(observed)
+    times = _times(observed, steps, times)
     timing = _timing(steps, times, t0, unit, inputs, input_times, inputs_at)
     placed = place(system, timing._replace(earlier=earlier))
     (axis,), (rows,) = placed.axes, placed.inputs
@@ -68,6 +68,19 @@ def checked_record(
         data = check_observed(observed, system, axis.steps.size)
     rows = check_inputs(rows, placed.system, axis)
     return CheckedRecord(placed.system, placed.clock, axis, data, rows)
+
+
+def _times(observed: Any, steps: Any, times: Any) -> Any:
+    """The times of a record: those given, else the dates that the data bring."""
+    if steps is not None or times is not None:
+        return times
+    found = times_of_data(observed)
+    if found is None and isinstance(observed, pd.Series | pd.DataFrame):
+        raise ModelError(
+            "give exactly one of steps and times, or dates as the index of observed (read text with"
+            f" pd.to_datetime): it holds no dates, got {shortened(observed.index)}"
+        )
+    return found
 
 
 def _timing(
@@ -106,8 +119,7 @@ def symbolic_record(
     inputs_at: Any,
 ) -> SymbolicRecord:
     """Check every part of a record as far as it is known: numbers and the values of shared data."""
-    if steps is None and times is None:
-        times = times_of_data(observed)
+    times = _times(observed, steps, times)
     is_symbolic = isinstance(steps, Variable)
     current = steps.eval() if is_symbolic else steps
     placed = place(system, _timing(current, times, t0, unit, inputs, input_times, inputs_at))

@@ -97,11 +97,6 @@ def axis_of(given: TimesBetween, dt: float, *, on_grid: bool) -> TimeAxis:
 def divided_axis(times: np.ndarray, *, t0: float, dt: float, breaks: np.ndarray) -> TimeAxis:
     """The axis whose gaps between times and breaks are divided into steps of at most ``dt``."""
     tolerance = GRID_TOLERANCE * dt
-    if times[0] < t0 - tolerance:
-        raise ModelError(
-            f"times must not lie before t0 = {t0:.15g}, where the initial state holds, got "
-            f"times[0] = {times[0]:.15g}"
-        )
     at = np.maximum(times, t0)
     at[at - t0 <= tolerance] = t0
     inner = breaks[(breaks > t0 + tolerance) & (breaks < at[-1] - tolerance)]

@@ -7,8 +7,9 @@ import numpy as np
 
 from ..errors import ModelError
 from .checks import check_floats
-from .clock import Clock
+from .clock import Clock, times_of_data
 from .labels import columns_in_order
+from .model import StateSpaceModel
 from .steps import GRID_TOLERANCE
 from .time_axis import TimeAxis, check_increasing
 
@@ -16,11 +17,16 @@ INPUTS_AT = ("hold", "linear")
 
 
 class TimedInputs(NamedTuple):
-    """Values (R, n_inputs) from ``times`` (R,) on, or linear between them; see `INPUTS_AT`."""
+    """Values (R, n_inputs) from ``times`` (R,) on, or linear between them; see `INPUTS_AT`.
+
+    A step takes a linear input in its middle, or, where the observation at its beginning uses
+    inputs, ``at_beginning``.
+    """
 
     times: np.ndarray
     values: np.ndarray
     rule: str
+    at_beginning: bool
 
     def changes(self) -> np.ndarray:
         """The times at which held inputs change."""
@@ -37,17 +43,17 @@ class TimedInputs(NamedTuple):
                 f"input_times must begin at or before the first step, at {begin}, got {first}"
             )
         if self.rule == "hold":
-            at = np.searchsorted(self.times, starts + GRID_TOLERANCE * axis.dt, side="right") - 1
-            return self.values[at]
-        middles = starts + lengths / 2
-        middles[-1] = starts[-1]
-        if middles[-1] > self.times[-1] + GRID_TOLERANCE * axis.dt:
-            end, last = clock.shown([middles[-1], self.times[-1]], record)
+            last = np.searchsorted(self.times, starts + GRID_TOLERANCE * axis.dt, side="right") - 1
+            return self.values[last]
+        at = starts if self.at_beginning else starts + lengths / 2
+        at[-1] = starts[-1]
+        if at[-1] > self.times[-1] + GRID_TOLERANCE * axis.dt:
+            end, last = clock.shown([at[-1], self.times[-1]], record)
             raise ModelError(
                 f"input_times must reach the last observation, at {end}, with "
                 f"inputs_at='linear', got {last}"
             )
-        columns = [np.interp(middles, self.times, column) for column in self.values.T]
+        columns = [np.interp(at, self.times, column) for column in self.values.T]
         return np.stack(columns, axis=1)
 
 
@@ -55,11 +61,12 @@ def timed_inputs(
     inputs: Any,
     input_times: Any,
     inputs_at: Any,
-    names: Sequence[str],
+    system: StateSpaceModel,
     clock: Clock,
     record: int = 0,
 ) -> TimedInputs:
-    """Check inputs of these names with times of their own."""
+    """Check inputs of a system with times of their own."""
+    names = system.inputs
     check_inputs_at(inputs_at)
     times = clock.numbers("input_times", input_times, record)
     check_increasing("input_times", times, lambda time: clock.shown(time, record))
@@ -71,7 +78,26 @@ def timed_inputs(
             f"inputs must have shape {(times.size, len(names))}, a row for each of input_times and "
             f"a column for each input of the system, got {np.shape(inputs)}"
         )
-    return TimedInputs(times, values, inputs_at)
+    return TimedInputs(times, values, inputs_at, system.observation_has_u)
+
+
+def times_of_inputs(inputs: Sequence[Any], input_times: list[Any] | None) -> list[Any] | None:
+    """The times of the inputs of each record: those given, else the dates in their own index.
+
+    None for inputs by step.
+    """
+    if input_times is not None:
+        return input_times
+    found = [times_of_data(own) for own in inputs]
+    missing = [own is None for own in found]
+    if all(missing):
+        return None
+    if any(missing):
+        raise ModelError(
+            "inputs must have dates as their index in all records or in none, got none in record "
+            f"number {missing.index(True)}"
+        )
+    return found
 
 
 def check_inputs_at(inputs_at: Any) -> None:

@@ -231,6 +231,56 @@ def test_linear_inputs_are_those_of_the_middle_of_a_step():
     np.testing.assert_allclose(total([0.0, 2.0], [0.0, 2.0], "linear"), [0.245, 2.0], rtol=1e-12)
 
 
+STAR = psf.StateSpaceModel(
+    transition=psf.EulerMaruyama(lambda x: [0.0], [[0.0]], dt=1.0),
+    inputs=["error"],
+    **SETTINGS
+    | {
+        "observation_noise": lambda u: [[u[0] ** 2]],
+        "initial_mean": [0.0],
+        "initial_cov": [[0.0]],
+    },
+)
+
+
+def errors_used(times=None, panel=None, n=3, **settings):
+    """The standard deviation of each observation, from its term: data and states are zeros."""
+    data = pd.Series(np.zeros(n), times) if panel is None else np.zeros(n)
+    settings |= {} if panel is None else {"panel": panel, "times": times}
+    terms = psf.log_likelihood(STAR, psf.EKF(), {}, data, **settings)
+    return np.exp(-terms) / np.sqrt(2 * np.pi)
+
+
+@pytest.mark.parametrize("inputs_at", ["hold", "linear"])
+@pytest.mark.parametrize("end", [3.0, 3.25], ids=["grid", "any times"])
+def test_an_observation_has_the_inputs_of_its_time(inputs_at, end):
+    run = psf.run_filter(
+        STAR, psf.EKF(), {}, np.zeros(3), times=[1.0, 2.0, end],
+        inputs=[0.1, 0.1, 1.0, 0.2], input_times=[0.0, 1.0, 2.0, end], inputs_at=inputs_at,
+    )  # fmt: skip
+    sd = np.exp(-run["log_likelihood"]) / np.sqrt(2 * np.pi)
+    np.testing.assert_allclose(sd, [0.1, 1.0, 0.2], rtol=1e-12)
+
+
+def test_inputs_bring_their_dates():
+    days = pd.date_range("2024-01-02", periods=3)
+    dated = pd.DataFrame(
+        {"error": np.arange(1.0, 11.0)}, index=pd.date_range("2023-12-30", periods=10)
+    )
+    settings = {"unit": "D", "t0": pd.Timestamp("2024-01-01")}
+    found = errors_used(days, inputs=dated, **settings)
+    np.testing.assert_allclose(found, [4.0, 5.0, 6.0], rtol=1e-12)
+    found = errors_used(days, inputs=dated["error"], inputs_at="linear", **settings)
+    np.testing.assert_allclose(found, [4.0, 5.0, 6.0], rtol=1e-12)
+    panel = {"panel": ["A", "A", "B"], **settings}
+    found = errors_used(days, inputs=dated, **panel)
+    np.testing.assert_allclose(found, [4.0, 5.0, 6.0], rtol=1e-12)
+    found = errors_used(days, inputs={"A": dated["error"], "B": 2 * dated["error"]}, **panel)
+    np.testing.assert_allclose(found, [4.0, 5.0, 12.0], rtol=1e-12)
+    with pytest.raises(ModelError, match="inputs must have dates as their index in all records"):
+        errors_used(days, inputs={"A": dated, "B": dated.to_numpy()}, **panel)
+
+
 @pytest.mark.parametrize(
     ("inputs", "input_times", "settings", "message"),
     [
@@ -317,6 +367,19 @@ def test_records_of_a_panel_start_at_their_own_first_dates():
         ({"times": DATES - START}, "got durations"),
         ({"times": TIMES, "t0": START}, "t0 must be a number"),
         ({"times": DATES, "unit": "D", "t0": DATES[3]}, "times must not lie before t0"),
+        ({"times": DATES, "unit": "D", "t0": "2020-01-01"}, r"write pd.Timestamp\('2020-01-01'\)"),
+        (
+            {"times": DATES, "unit": "D", "t0": DATES[3]},
+            "before t0 = 2020-03-03T.*got times.0. = 2020-03-01T",
+        ),
+        (
+            {"times": pd.DatetimeIndex(DATES, tz="UTC"), "unit": "D", "t0": START},
+            "t0 must have a time zone, as times",
+        ),
+        (
+            {"times": DATES, "unit": "D", "t0": pd.Timestamp(START, tz="UTC")},
+            "times must have a time zone, as t0",
+        ),
         (
             {"times": np.append(DATES[:-1], np.datetime64("NaT", "s")), "unit": "D"},
             "got none in row 19",
@@ -326,6 +389,18 @@ def test_records_of_a_panel_start_at_their_own_first_dates():
 def test_dates_that_are_refused(settings, message):
     with pytest.raises(ModelError, match=message):
         checked_record(EXACT, DATA, **settings)
+
+
+def test_an_index_without_dates_is_named():
+    for index in (DATES.astype(str), None):
+        with pytest.raises(ModelError, match=r"index of observed.*pd.to_datetime.*no dates"):
+            checked_record(EXACT, pd.Series(DATA, index=index))
+
+
+def test_missing_values_of_pandas_are_missing():
+    series = pd.Series([1, None, 3], dtype="Int64")
+    record = checked_record(EXACT, series, steps=[0, 1, 2])
+    np.testing.assert_array_equal(record.observed[:, 0], [1.0, np.nan, 3.0])
 
 
 def test_panel_from_a_table_with_dates():
