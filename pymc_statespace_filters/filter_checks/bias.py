@@ -64,10 +64,9 @@ def bias_at_draws(found: Comparison, points: Points, names: Sequence[str]) -> li
         return [Finding("bias", np.nan, np.nan, ALPHA, np.inf, UNDECIDED, verdict)]
     moved = _shifts(found, points, names, reference)
     visible = abs(bias.mean) + bias.margin
-    what = (
-        f"{name} is {nats(abs(bias.mean))} ± {nats(bias.se)} nats "
-        f"{'below' if bias.mean < 0.0 else 'above'} {short_form(reference.filter)} at draws"
-    )
+    size = f"{nats(abs(bias.mean))} ± {nats(bias.se)} nats"
+    side, other = "below" if bias.mean < 0.0 else "above", short_form(reference.filter)
+    what = f"{name} is {size} {side} {other} at draws"
     worst = max(moved, key=lambda one: abs(one.statistic), default=None)
     moves = "" if worst is None else f"; {worst.verdict}"
     is_moved = any(one.outcome == OFF for one in moved)
@@ -81,7 +80,11 @@ def bias_at_draws(found: Comparison, points: Points, names: Sequence[str]) -> li
         outcome = UNDECIDED
         verdict = f"undecided whether {name} is off: {what}{moves}, which is too uncertain to tell"
     elif visible <= VISIBLE:
-        outcome, verdict = FINE, f"no sign that {name} is off: {what}{moves}"
+        outcome = FINE
+        verdict = (
+            f"{name} is close to {other}: {size} {side} it at draws{moves} (a warning begins where "
+            f"more than {TOLERATED:g} nat or {_TOLERATED_SHIFT:g} sd are certain)"
+        )
     else:
         outcome = UNDECIDED
         verdict = f"undecided whether {name} is off: {what}, too uncertain to exclude {VISIBLE:g}"

@@ -18,6 +18,7 @@ from .run.continuation import appended, former_chains
 from .run.driver import sample_models
 from .run.ranks import Ranks
 from .run.request import ExecutionOptions, SamplingRequest, sampling_request
+from .run.stopping import AUTO, target_ess
 from .target.settings import RandomWalkSettings
 
 _SAMPLERS = ("auto", NUTS, DRAM)
@@ -35,7 +36,7 @@ def sample(
     tune: int = 1000,
     *,
     model: Model | None = None,
-    until_ess: float | None = 400.0,
+    until_ess: float | str | None = AUTO,
     max_draws: int | None = None,
     chains: int = 4,
     cores: int | None = None,
@@ -61,12 +62,14 @@ def sample(
     Parameters
     ----------
     draws, tune : int
-        Draws of each chain that are kept, and iterations of its warm-up, which are not.
+        Draws of each chain that are kept, and iterations of its warm-up, which are not. NUTS needs
+        a warm-up.
     model : pymc.Model, optional
         Default: the model of the ``with`` block. Its free variables must be continuous.
-    until_ess : float, optional
+    until_ess : float or "auto", optional
         Effective draws of every parameter over all chains, of the bulk and of the tails, with R-hat
-        of at most 1.01. None keeps the first ``draws`` iterations.
+        of at most 1.01 (1 + 2 / draws for fewer than 200). Default: 400, or half of the draws that
+        are kept if these are fewer than 800. None keeps the first ``draws`` iterations.
     max_draws : int, optional
         Iterations of each chain at most. Default: 1024 times ``draws`` with the random walk, 64
         times with NUTS. The run also ends where the next doubling would take it beyond five
@@ -142,13 +145,13 @@ def sample(
         request = _continued(request, continue_from, model)
     level = logging.INFO if progressbar else logging.DEBUG
     _log.log(level, "%s: %s", _NAMES[choice.sampler], choice.reason)
+    options = ExecutionOptions(cores, progressbar, True, Ranks.of(comm))
     tree: DataTree | None
     if choice.sampler == NUTS:
         from .nuts.sample_nuts import sample_nuts  # nutpie takes longer to import than the rest
 
-        tree = sample_nuts(model, request, cores=cores, progressbar=progressbar)
+        tree = sample_nuts(model, request, options)
     else:
-        options = ExecutionOptions(cores, progressbar, True, Ranks.of(comm))
         folders = [] if checkpoint is None else [checked_folder(checkpoint)]
         trees = sample_models({"": model}, [request], options, folders)
         tree = None if trees is None else trees[""]
@@ -171,10 +174,14 @@ def _choice(
             raise ModelError(f"{asked[0]} must be None with sampler='nuts': sampler='dram' has it")
         if reason := why_no_nuts(model):
             raise ModelError(f"sampler must be 'dram' for this model, got 'nuts': {reason}")
+        if tune == 0:
+            raise ModelError("tune must be at least 1 with sampler='nuts', got 0")
     if sampler != "auto":
         return Choice(sampler, f"sampler={sampler!r}")
     if asked:
         return Choice(DRAM, f"NUTS has no {asked[0]}")
+    if tune == 0:
+        return Choice(DRAM, "NUTS needs a warm-up, and tune is 0")
     return choose_sampler(model, chains, tune)
 
 
@@ -185,10 +192,11 @@ def _request(
     chains: int,
     random_seed: Any,
     initvals: Any,
-    until_ess: float | None,
+    until_ess: float | str | None,
     max_draws: int | None,
     kernel: RandomWalkSettings | None,
 ) -> SamplingRequest:
+    until_ess = target_ess(until_ess, draws, chains)
     request = sampling_request(
         draws, tune, chains, random_seed, initvals, False, until_ess, max_draws, kernel
     )

@@ -51,7 +51,7 @@ def test_a_filter_that_is_right_has_a_sentence_in_the_report(caplog):
     with caplog.at_level(logging.DEBUG, "pymc.stats.convergence"):
         idata = psf.sample_dram(model=model_of(0.02), progressbar=False, **SETTINGS)
     assert outcome_of(idata) == "no sign"
-    (said,) = [one for one in caplog.records if "no sign that EKF() is off" in one.message]
+    (said,) = [one for one in caplog.records if "EKF() is close to GridFilter()" in one.message]
     assert said.levelno == logging.DEBUG
 
 

@@ -8,15 +8,15 @@ import xarray as xr
 import pymc_statespace_filters as psf
 from pymc_statespace_filters import sample
 from pymc_statespace_filters.sampling import choice
-from pymc_statespace_filters.sampling.kernel.state import Draws
+from pymc_statespace_filters.sampling.kernel.state import N_ACCEPTED, N_COUNTS, Draws
 from pymc_statespace_filters.sampling.output.convergence import convergence
+from pymc_statespace_filters.sampling.output.warnings import PhaseStatistics
 from pymc_statespace_filters.sampling.run.thinned_draws import Thinning, add_iterations, coarsen
 from tests.kernels import with_kernel
 from tests.sampling.test_dram import simple_model
 from tests.sampling.test_sample_dram import state_space_model
 
 QUIET = {"random_seed": 1, "progressbar": False}
-ENDLESS = 1e9  # effective draws that no chain reaches
 
 
 def made_up_draws(n, rng):
@@ -65,7 +65,7 @@ def test_a_draw_is_the_last_of_k_iterations(every_iteration, draws):
     """Whether k was given, or found by doubling; an odd number of draws leaves half a row."""
     call = {"model": simple_model(), "chains": 2, "tune": 100, **QUIET}
     thinned = psf.sample_dram(draws, thin=4, **call)
-    doubled = sample(draws, until_ess=ENDLESS, max_draws=4 * draws + 1, **call)
+    doubled = sample(draws, until_ess=2 * draws, max_draws=4 * draws + 1, **call)
     whole = every_iteration["sample_stats"].isel(draw=slice(0, 4 * draws))
     for name, values in every_iteration["posterior"].data_vars.items():
         np.testing.assert_array_equal(thinned["posterior"][name], values[:, 3 : 4 * draws : 4])
@@ -99,7 +99,7 @@ def test_a_doubled_run_resumes_with_the_same_bits(tmp_path, monkeypatch, n_parts
     from pymc_statespace_filters.sampling.run import chain_task
 
     call = {"model": simple_model(), "chains": 2, "tune": 40, "cores": 1, **QUIET}
-    call |= {"draws": 25, "until_ess": ENDLESS, "max_draws": 200}
+    call |= {"draws": 25, "until_ess": 50, "max_draws": 200}
     expected = sample(**call)
     monkeypatch.setattr(chain_task, "CHECKPOINT_SECONDS", 0.0)
     made = []
@@ -140,10 +140,39 @@ def test_a_run_ends_as_soon_as_its_draws_are_worth_enough():
 def test_the_end_of_a_run_that_reached_nothing(caplog):
     """By its iterations, and by its time, with what would do."""
     call = {"model": simple_model(), "tune": 100, **QUIET}
-    sample(50, until_ess=ENDLESS, max_draws=100, **call)
+    sample(50, until_ess=100, max_draws=100, **call)
     assert "was not reached with 100 iterations" in caplog.text
     assert "iterations of each chain would do" in caplog.text
     assert "larger max_draws than 100" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("draws", "chains", "said"),
+    [(100, 1, "Give more draws"), (50, 4, "Give more draws"), (1, 1, "")],
+)
+def test_few_draws_are_asked_for_what_they_can_show(draws, chains, said, caplog):
+    tree = sample(draws, 100, model=simple_model(), chains=chains, **QUIET)
+    assert tree.attrs["iterations_per_draw"] <= 64
+    assert said in caplog.text
+    assert "hardly moves" not in caplog.text
+    assert "stayed at one point" not in caplog.text
+
+
+def test_more_than_the_draws_show(caplog):
+    """Half of them and more is allowed, and the advice is the only one that works."""
+    sample(30, 100, model=simple_model(), chains=2, until_ess=59, max_draws=30, **QUIET)
+    assert "Give more draws: 2 * 30 hardly show so many" in caplog.text
+    assert "would do" not in caplog.text
+
+
+def test_a_row_that_moved_may_have_moved_at_its_end():
+    counts = np.zeros((5, N_COUNTS), int)
+    counts[[1, 4], N_ACCEPTED] = 1
+    numbers = np.ones((5, 4))
+    draws = made_up_draws(5, np.random.default_rng(1))._replace(counts=counts, numbers=numbers)
+    assert PhaseStatistics.from_draws(draws, 0, 5).longest_dwell == 3
+    assert PhaseStatistics.from_draws(draws, 0, 5, thin=8).longest_dwell == 2 * 8 + 1
+    assert PhaseStatistics.from_draws(draws, 1, 2, thin=1024).longest_dwell == 1
 
 
 def linear_model(n, filter=None, *, kink=False):
@@ -171,6 +200,7 @@ def test_the_choice():
     assert choice.why_no_nuts(linear_model(3)) == ""
     assert "noise" in choice.why_no_nuts(linear_model(3, psf.BootstrapPF(10)))
     assert "no gradient" in choice.why_no_nuts(linear_model(3, psf.GridFilter()))
+    assert sample(5, 0, model=linear_model(3), **QUIET).attrs["sampler"] == "dram"
     kinked = choice.choose_sampler(linear_model(200, kink=True), 4, 1000)
     assert kinked == ("dram", "the equations of 'd' have kinks or jumps")
     few, many = (choice.choose_sampler(linear_model(n), 4, 1000) for n in (3, 200))
@@ -210,9 +240,7 @@ def two_parts(request, tmp_path_factory):
 def test_chains_go_on_with_the_bits_of_one_run(two_parts):
     whole, both, _, _ = two_parts
     for group in ("posterior", "sample_stats", "sampler_state"):
-        mine, theirs = both[group].to_dataset(), whole[group].to_dataset()
-        cumulative = [name for name in ("accept_rate",) if name in mine]
-        xr.testing.assert_equal(mine.drop_vars(cumulative), theirs.drop_vars(cumulative))
+        xr.testing.assert_equal(both[group].to_dataset(), whole[group].to_dataset())
     assert both["sampler_state"].attrs == whole["sampler_state"].attrs
     assert both["posterior"].attrs["tuning_steps"] == 60
 
@@ -230,6 +258,9 @@ def test_chains_that_cannot_go_on(two_parts):
     for arguments, message in refused:
         with pytest.raises((psf.errors.ModelError, psf.errors.DataMismatchError), match=message):
             sample(10, continue_from=first, **arguments)
+    for part in (slice(0, 20), slice(None, None, 2)):
+        with pytest.raises(psf.errors.ModelError, match="must have all draws of its run, 30 of"):
+            sample(10, continue_from=first.isel(draw=part), **call)
     short = first.copy()
     del short["sampler_state"]
     with pytest.raises(psf.errors.ModelError, match="must have the group 'sampler_state'"):
@@ -245,6 +276,13 @@ REFUSALS = [
     ({"sampler": "nuts", "checkpoint": "x"}, "checkpoint must be None with sampler='nuts'"),
     ({"sampler": "nuts", "comm": "world"}, "comm must be None with sampler='nuts'"),
     ({"sampler": "nuts", "initvals": [{}] * 4}, "initvals must be a mapping for sampler='nuts'"),
+    ({"sampler": "nuts", "initvals": {"x": 1.0}}, "initvals must name free variables .* got 'x'"),
+    ({"sampler": "nuts", "cores": 0}, "cores must be None or an integer of at least 1, got 0"),
+    ({"sampler": "nuts", "tune": 0}, "tune must be at least 1 with sampler='nuts', got 0"),
+    (
+        {"draws": 100, "until_ess": 401},
+        r"until_ess must be at most .* 4 \* 100, got 401: give more",
+    ),
     ({"kernel": {"stages": 1}}, r"kernel must be psf.RandomWalkSettings\(...\), got"),
     ({"until_ess": 0}, "until_ess must be"),
     ({"until_ess": None, "max_draws": 5}, "max_draws needs until_ess"),

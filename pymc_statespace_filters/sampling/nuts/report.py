@@ -31,7 +31,7 @@ def messages_of(
     if request.until_ess is not None and not is_enough(request, chains.found):
         slowest = names[0] if chains.found is None else names[int(chains.found.rhat.argmax())]
         n, ways = chains.length.n_iterations, f"use sampler='dram', or reparametrise {slowest}"
-        remedy = remedy_of(request, chains.length, ways)
+        remedy = remedy_of(request, chains.length, chains.found, chains.seconds, ways)
         arguments = request.until_ess, n, chains.seconds, chains.found, names, remedy
         problems.append(until_ess_warning(*arguments))
     text = _report(chains, request, names)

@@ -16,9 +16,10 @@ from ...pymc_model.inspection import element_names, exactness, filters_used
 from ..output.datatree import to_datatree
 from ..output.filter_check import FilterCheck, check_filters, warn_of_filters
 from ..output.unvisited import unvisited_warnings
-from ..run.request import SamplingRequest
+from ..run.request import ExecutionOptions, SamplingRequest
 from ..starts.modes import modes_message, modes_warning
 from ..starts.population import find_population
+from ..target.initial_points import check_initvals
 from ..target.settings import RandomWalkSettings
 from ..target.target import Target
 from ..target.variables import check_no_generators
@@ -29,11 +30,12 @@ from .report import messages_of
 Array = NDArray[np.float64]
 
 
-def sample_nuts(
-    model: Model, request: SamplingRequest, *, cores: int | None, progressbar: bool | str
-) -> DataTree:
+def sample_nuts(model: Model, request: SamplingRequest, options: ExecutionOptions) -> DataTree:
     """Draw from the posterior by nutpie; errors are those of `sample`."""
+    options.check()
     check_no_generators(model)
+    _check_initvals(model, request)
+    progressbar = options.progressbar
     rng = np.random.default_rng(request.entropy)
     target = Target(model, None, RandomWalkSettings())
     start = _start(model, target, request, rng, progressbar=bool(progressbar))
@@ -42,7 +44,7 @@ def sample_nuts(
         start,
         target.raveled.dim,
         request,
-        cores=cores or available_cores(),
+        cores=options.cores or available_cores(),
         seed=int(rng.integers(2**32)),
         progressbar=progressbar,
     )
@@ -60,6 +62,16 @@ def sample_nuts(
     log_warnings([*messages, *check.messages(level)])
     warn_of_filters(check.warned)
     return tree
+
+
+def _check_initvals(model: Model, request: SamplingRequest) -> None:
+    initvals = request.initvals
+    if initvals is not None and not isinstance(initvals, Mapping):
+        raise ModelError(
+            f"initvals must be a mapping for sampler='nuts', got {type(initvals).__name__}: "
+            "sampler='dram' takes one for each chain"
+        )
+    check_initvals(model, initvals, request.chains)
 
 
 def _tree(model: Model, target: Target, chains: NutsChains, request: SamplingRequest) -> DataTree:
@@ -99,11 +111,6 @@ def _start(
     Or at the user's point, or, if a prior is improper, near the model's initial point.
     """
     initvals = request.initvals
-    if initvals is not None and not isinstance(initvals, Mapping):
-        raise ModelError(
-            f"initvals must be a mapping for sampler='nuts', got {type(initvals).__name__}: "
-            "sampler='dram' takes one for each chain"
-        )
     if initvals is not None or not target.prior_draws.may_start:
         point = make_initial_point_fn(model=model, overrides=dict(initvals or {}))
         centre, width = target.raveled.ravel(point(0)), 0.0 if initvals else 1.0

@@ -10,7 +10,7 @@ from .datatree import most_iterations
 # Above this R-hat the chains disagree: the limit of `pm.sample` and of Vehtari and others (2021).
 MAX_RHAT = 1.01
 # Fewest draws of a chain from which ArviZ computes either.
-_FEWEST = 4
+FEWEST = 4
 _TAILS = (0.05, 0.95)  # whose effective sample size is that of the tails
 
 
@@ -26,9 +26,9 @@ class Convergence(NamedTuple):
     tail: np.ndarray  # (d,), of the quantiles of 5 and 95 %
     rhat: np.ndarray  # (d,), infinity where no chain has moved
 
-    def reaches(self, until_ess: float) -> bool:
-        """Whether every effective sample size is large enough, and no R-hat above `MAX_RHAT`."""
-        return bool(self.least_ess >= until_ess and self.rhat.max() <= MAX_RHAT)
+    def reaches(self, until_ess: float, most_rhat: float = MAX_RHAT) -> bool:
+        """Whether every effective sample size is large enough, and no R-hat too large."""
+        return bool(self.least_ess >= until_ess and self.rhat.max() <= most_rhat)
 
     @property
     def least_ess(self) -> float:
@@ -54,7 +54,7 @@ def convergence(chains: Sequence[np.ndarray], most_draws: int | None = None) -> 
     little too small.
     """
     kept, n = most_iterations([len(positions) for positions in chains])
-    if n < _FEWEST:
+    if n < FEWEST:
         return None
     rows = slice(0, n, 1 if most_draws is None else -(-n // most_draws))
     elements = range(chains[0].shape[1])  # one by one, which takes the least memory

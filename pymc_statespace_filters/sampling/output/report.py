@@ -10,7 +10,7 @@ from .datatree import most_iterations
 from .warnings import PhaseStatistics, sampler_warning
 
 # Effective draws of each chain below which PyMC takes neither diagnostic for reliable.
-_ENOUGH_PER_CHAIN = 100
+ENOUGH_PER_CHAIN = 100
 
 
 def closing_report(
@@ -36,7 +36,7 @@ def closing_report(
 def mixing_warning(
     found: Convergence | None,
     names: Sequence[str],
-    n_chains: int,
+    enough: float,
     n_iterations: int,
     seconds: float,
     ways: Callable[[str], str],
@@ -47,7 +47,6 @@ def mixing_warning(
     """
     if found is None:
         return sampler_warning("The number of draws is too small to check convergence.")
-    enough = float(_ENOUGH_PER_CHAIN * n_chains)
     if found.reaches(enough):
         return None
     text = f"The chains have not mixed: {found.described(names)}. "
@@ -56,6 +55,14 @@ def mixing_warning(
     if found.rhat.max() > MAX_RHAT:
         text += f"If R-hat stays above {MAX_RHAT}, {ways(names[int(found.rhat.argmax())])}."
     return sampler_warning(text.strip())
+
+
+def few_draws_warning(found: Convergence, names: Sequence[str], n_draws: int) -> SamplerWarning:
+    """Warn that the draws of a run that went on until they are nearly independent are few."""
+    return sampler_warning(
+        f"{n_draws} draws in all are too few to be sure that the chains have mixed: "
+        f"{found.described(names)}. Give more draws."
+    )
 
 
 def needed(found: Convergence, enough: float, n_iterations: int, seconds: float) -> str:
@@ -84,14 +91,11 @@ def until_ess_warning(
     names: Sequence[str],
     remedy: str,
 ) -> SamplerWarning:
-    """Warn that chains have ended before they had reached ``until_ess``, with what would do."""
-    reached, would_do = "", ""
-    if found is not None:
-        reached = f": {found.described(names)}"
-        would_do = f"{needed(found, until_ess, n_iterations, seconds)}; "
+    """Warn that chains have ended before they had reached ``until_ess``, with what to do."""
+    reached = "" if found is None else f": {found.described(names)}"
     return sampler_warning(
         f"until_ess={until_ess:g} was not reached with {n_iterations} iterations of each chain in "
-        f"{duration(seconds)}{reached}. {would_do}{remedy}."
+        f"{duration(seconds)}{reached}. {remedy[0].upper()}{remedy[1:]}."
     )
 
 

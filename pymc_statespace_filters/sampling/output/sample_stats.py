@@ -112,7 +112,7 @@ def whole_chain(
     n = len(draws.positions)
     stats = {name: values.copy() for name, values in of_draws(target, draws, slice(0, n)).items()}
     accepted = n_accepted(draws.counts)[:, 0] / _n_behind(n, tune, thin)
-    stats |= {"accepted": accepted, "accept_rate": _running_means(accepted, tune)}
+    stats |= {"accepted": accepted, "accept_rate": _means_of_phases(accepted, tune)}
     covs = np.broadcast_to(state.proposal_cov, (n, *state.proposal_cov.shape))
     if len(draws.covs):
         covs = np.concatenate([draws.covs[:n], covs[tune:]])
@@ -124,10 +124,15 @@ def _n_behind(n: int, tune: int, thin: int) -> np.ndarray:
     return np.where(np.arange(n) < tune, 1, thin)
 
 
-def _running_means(values: np.ndarray, tune: int) -> np.ndarray:
+def _means_of_phases(values: np.ndarray, tune: int) -> np.ndarray:
     """Means since the beginning of the warm-up, and since its end."""
     phases = np.split(values, [tune])
-    return np.concatenate([np.cumsum(of) / np.arange(1, of.size + 1) for of in phases])
+    return np.concatenate([running_means(of) for of in phases])
+
+
+def running_means(values: np.ndarray) -> np.ndarray:
+    """Means of all values so far, along the last axis."""
+    return np.cumsum(values, axis=-1) / np.arange(1, values.shape[-1] + 1)
 
 
 def _of_records(target: RecordTarget, draws: Draws, tune: int, thin: int) -> dict[str, np.ndarray]:
@@ -140,7 +145,7 @@ def _of_records(target: RecordTarget, draws: Draws, tune: int, thin: int) -> dic
     stats |= {name: counts[:, column].copy() for name, column in _RECORD_COUNTS.items()}
     stats |= {
         "accepted": accepted,
-        "accept_rate": _running_means(accepted, tune),
+        "accept_rate": _means_of_phases(accepted, tune),
         "record_accepted": moved,
         "exact": np.full(n, target.exact),
     }

@@ -102,10 +102,7 @@ class PhaseStatistics(NamedTuple):
         )
         n, accepted = thin * len(counts), n_accepted(counts)
         rates = accepted.sum(axis=0) / max(n, 1)
-        dwells = [
-            thin * np.diff(np.flatnonzero(of_part), prepend=0, append=len(counts))
-            for of_part in accepted.T
-        ]
+        dwells = [_dwells(np.flatnonzero(of_part), len(counts), thin) for of_part in accepted.T]
         slowest = int(np.argmax([of_part.max() for of_part in dwells]))
         statistics = cls(
             n,
@@ -132,6 +129,13 @@ class PhaseStatistics(NamedTuple):
     def accept_rate(self) -> float:
         """Fraction of the iterations that accepted a proposal."""
         return self.moved / self.iterations if self.iterations else 0.0
+
+
+def _dwells(moved: np.ndarray, n: int, thin: int) -> np.ndarray:
+    """Iterations at each point at least, if these rows of n have moved, once or more often."""
+    dwells = thin * np.diff(moved, prepend=0, append=n)
+    dwells[1:] -= thin - 1  # a row that has moved may have done so at its end
+    return dwells
 
 
 class Problem(NamedTuple):
@@ -216,6 +220,8 @@ def _screen_problem(statistics: PhaseStatistics) -> str | None:
 
 def _mobility_problem(statistics: PhaseStatistics, *, is_noisy: bool) -> str | None:
     n, screened = statistics.iterations, statistics.screened
+    if n < LEAST_DWELL:
+        return None
     if statistics.accept_rate < MIN_ACCEPT_RATE:
         remedies = ["tune longer", "start elsewhere (initvals)", "give proposal_cov"]
         remedies += ["give the filter more particles (psf.suggest_particles)"] * is_noisy

@@ -17,6 +17,7 @@ from ...errors import DataMismatchError, ModelError
 from ...pymc_model.posterior_draws import posterior_group, unconstrained_draws
 from ..checkpoint.manifest import model_data_fingerprint, model_fingerprint
 from ..kernel.state import ChainState
+from ..output.sample_stats import running_means
 from ..target.settings import RandomWalkSettings
 
 GROUP = "sampler_state"
@@ -45,6 +46,7 @@ def stored_states(
     states: list[ChainState],
     *,
     iterations: int,
+    draws: int,
     thin: int,
     settings: RandomWalkSettings,
 ) -> DataTree | None:
@@ -68,6 +70,7 @@ def stored_states(
     data = {name: (("chain", f"{name}_dim"), values) for name, values in arrays.items()}
     attrs = {
         "iterations": int(iterations),
+        "draws": int(draws),
         "thin": int(thin),
         "kernel": repr(settings),
         "model": fingerprint,
@@ -108,6 +111,12 @@ def former_chains(
         ChainState(**{str(name): a[i].copy() for name, a in arrays.items()}, carried=np.empty(0))
         for i in range(chains)
     ]
+    n_draws = idata["posterior"].sizes["draw"]
+    if n_draws != group.attrs["draws"]:
+        raise ModelError(
+            f"continue_from must have all draws of its run, {group.attrs['draws']} of each chain, "
+            f"got {n_draws}: select from the result"
+        )
     positions = list(unconstrained_draws(idata, model))
     return FormerChains(states, int(group.attrs["iterations"]), int(group.attrs["thin"]), positions)
 
@@ -144,6 +153,9 @@ def appended(former: DataTree, tree: DataTree) -> DataTree:
         )
         whole = whole.assign({v: parts[1][v] for v in frozen})
         whole = whole.assign_coords(draw=np.arange(whole.sizes["draw"]))
+        if "accept_rate" in whole:  # the mean since the warm-up
+            accepted = whole["accepted"]
+            whole["accept_rate"] = accepted.copy(data=running_means(accepted.values))
         tree[name] = DataTree(whole)
     seconds = [one["posterior"].attrs.get("sampling_time", 0.0) for one in (former, tree)]
     tree["posterior"].attrs |= {

@@ -21,8 +21,10 @@ from ..output.filter_check import FilterCheck, check_filters, warn_of_filters
 from ..output.likelihood_variance import is_measured, spread_at_highest_draw
 from ..output.remedies import ways_to_mix
 from ..output.report import (
+    ENOUGH_PER_CHAIN,
     below_known_warning,
     closing_report,
+    few_draws_warning,
     left_out_warnings,
     mixing_warning,
     until_ess_warning,
@@ -51,7 +53,7 @@ from .population_search import (
 )
 from .record_chain import chain_of
 from .request import SamplingRequest
-from .stopping import Length, first_length, is_enough, next_length, remedy_of
+from .stopping import Length, first_length, is_enough, next_length, remedy_of, shows
 from .thinned_draws import Thinning
 
 # Draws of each chain from which diagnostics are computed while chains run; of ten parameters this
@@ -383,6 +385,7 @@ class ModelTask:
             self.model,
             [self._results[i][1] for i in range(request.chains)],
             iterations=self.n_iterations + (0 if former is None else former.iterations),
+            draws=self.length.draws + (0 if former is None else len(former.positions[0])),
             thin=self.thin,
             settings=request.settings,
         )
@@ -427,11 +430,14 @@ class ModelTask:
         until_ess, ways = request.until_ess, partial(ways_to_mix, self.model)
         if until_ess is not None and self.is_complete and not is_enough(request, found):
             slowest = names[0] if found is None else names[int(found.rhat.argmax())]
-            remedy = remedy_of(request, self.length, ways(slowest))
+            remedy = remedy_of(request, self.length, found, self._seconds, ways(slowest))
             return [until_ess_warning(until_ess, n, self._seconds, found, names, remedy)]
         if not check_convergence:
             return []
-        warning = mixing_warning(found, names, request.chains, n, self._seconds, ways)
+        enough = float(ENOUGH_PER_CHAIN * request.chains)
+        if found is not None and not shows(request, enough) and not found.reaches(enough):
+            return [few_draws_warning(found, names, request.chains * request.draws)]
+        warning = mixing_warning(found, names, enough, n, self._seconds, ways)
         return [] if warning is None else [warning]
 
     def _unreached_warnings(

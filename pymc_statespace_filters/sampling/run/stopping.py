@@ -3,8 +3,18 @@
 import math
 from typing import NamedTuple
 
-from ..output.convergence import Convergence
+from ...errors import ModelError
+from ...system.checks import check_count, check_positive
+from ..output.convergence import FEWEST, MAX_RHAT, Convergence
+from ..output.report import needed
 from .request import SamplingRequest
+
+AUTO = "auto"
+# Effective draws that `sample` makes unless it is told otherwise.
+_ENOUGH = 400.0
+# Independent draws show nine tenths of their number, or two thirds if they are few, and an R-hat of
+# up to 1 + 2 / draws (2 of 4 chains, where nine in ten of single chains stay below 3).
+_SHOWN_SHARE, _SHOWN_RHAT = 0.5, 2.0
 
 
 class Length(NamedTuple):
@@ -19,6 +29,29 @@ class Length(NamedTuple):
         return self.draws * self.thin
 
 
+def target_ess(until_ess: float | str | None, draws: int, chains: int) -> float | None:
+    """Effective draws to reach with so many draws of each chain; None if none are asked for.
+
+    Raises
+    ------
+    ModelError
+        If so many draws cannot be worth that, or an argument is not as `sample` describes it.
+    """
+    if until_ess is None:
+        return None
+    check_count("draws", draws, 0)
+    check_count("chains", chains, 1)
+    if isinstance(until_ess, str) and until_ess == AUTO:
+        return min(_ENOUGH, _SHOWN_SHARE * chains * draws) if draws >= FEWEST else None
+    until_ess = check_positive("until_ess", until_ess)
+    if until_ess > chains * draws:
+        raise ModelError(
+            f"until_ess must be at most the number of draws that are kept, {chains} * {draws}, got "
+            f"{until_ess:g}: give more draws"
+        )
+    return until_ess
+
+
 def first_length(request: SamplingRequest) -> Length:
     """The length after which chains end, or are looked at for the first time."""
     return Length(request.draws, request.thin)
@@ -26,7 +59,15 @@ def first_length(request: SamplingRequest) -> Length:
 
 def is_enough(request: SamplingRequest, found: Convergence | None) -> bool:
     """Whether draws are worth what the user asked for."""
-    return request.until_ess is None or (found is not None and found.reaches(request.until_ess))
+    if request.until_ess is None:
+        return True
+    shown = 1.0 + _SHOWN_RHAT / request.draws if request.doubles_thin else MAX_RHAT
+    return found is not None and found.reaches(request.until_ess, max(MAX_RHAT, shown))
+
+
+def shows(request: SamplingRequest, ess: float) -> bool:
+    """Whether the draws of a run, if independent, would show so many effective draws."""
+    return not request.doubles_thin or ess <= _SHOWN_SHARE * request.chains * request.draws
 
 
 def next_length(
@@ -46,13 +87,23 @@ def next_length(
     return length._replace(draws=draws) if draws > length.draws else None
 
 
-def remedy_of(request: SamplingRequest, length: Length, ways: str) -> str:
+def remedy_of(
+    request: SamplingRequest,
+    length: Length,
+    found: Convergence | None,
+    seconds: float,
+    ways: str,
+) -> str:
     """What to do if chains ended before their draws were worth enough; ``ways`` make them mix."""
+    enough = request.until_ess or 0.0
+    if not shows(request, enough):
+        return f"give more draws: {request.chains} * {request.draws} hardly show so many"
+    would_do = "" if found is None else f"{needed(found, enough, length.n_iterations, seconds)}; "
     if not request.doubles_thin:
-        return f"give a larger max_draws, {ways}"
+        return f"{would_do}give a larger max_draws, {ways}"
     if 2 * length.n_iterations > (request.max_draws or 0):
-        return f"give a larger max_draws than {request.max_draws}, {ways}"
+        return f"{would_do}give a larger max_draws than {request.max_draws}, {ways}"
     return (
-        f"the run ended as twice as many would take longer than its {request.seconds:.0f} s: make "
-        f"more with psf.sample(continue_from=idata), {ways}"
+        f"{would_do}the run ended as twice as many would take longer than its "
+        f"{request.seconds:.0f} s: make more with psf.sample(continue_from=idata), {ways}"
     )

@@ -168,7 +168,7 @@ def chain_candidates(
     ModelError
         If the values do not fit the model.
     """
-    _check_initvals(model, initvals, len(seeds))
+    check_initvals(model, initvals, len(seeds))
     points = make_initial_point_fns_per_chain(
         model=model, overrides=initvals, jitter_rvs=set(), chains=len(seeds)
     )
@@ -185,7 +185,8 @@ def chain_candidates(
     return [partial(candidates, start) for start in starts]
 
 
-def _check_initvals(model: Model, initvals: Any, chains: int) -> None:
+def check_initvals(model: Model, initvals: Any, chains: int) -> None:
+    """Raise a `ModelError` unless values are None, a mapping or one for each chain, and fit."""
     is_common = initvals is None or isinstance(initvals, Mapping)
     if not is_common:
         if not isinstance(initvals, list | tuple):
