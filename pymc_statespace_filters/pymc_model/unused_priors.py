@@ -23,7 +23,7 @@ _told: WeakKeyDictionary[pm.Model, set[str]] = WeakKeyDictionary()
 
 
 def warn_of_unused_priors(model: pm.Model) -> None:
-    """Warn once of each free variable whose posterior is its prior, but not of a Deterministic's."""
+    """Warn once of each free variable that nothing uses: its posterior is its prior."""
     nodes = state_space_nodes(model)
     fixed = {
         name: label for label, node in nodes.items() for name in _constant_parameters(model, node)
