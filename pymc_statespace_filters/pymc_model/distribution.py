@@ -22,6 +22,7 @@ from ..system.model import StateSpaceModel
 from ..system.panel import SymbolicPanel, symbolic_panel
 from ..system.parameters import check_names, symbolic_panel_parameters, symbolic_parameters
 from ..system.record import check_seed, symbolic_record
+from ..system.timed_inputs import TimedInputs
 from . import dispatch as dispatch  # registers draw and density
 from .random_variable import NUMBERS, PanelRV, StateSpaceRV
 
@@ -195,6 +196,7 @@ class StateSpace(Continuous):
             filter=filter,
             score_from=_check_score_from(score_from, n_rows),
             clock=record.clock,
+            timed=record.timed,
             observed=record.observed,
             dims=(row_dim, component_dim),
         )
@@ -207,6 +209,7 @@ class StateSpace(Continuous):
         filter: Filter,
         score_from: int = 0,
         clock: Clock = NUMBERS,
+        timed: tuple[TimedInputs, ...] = (),
         **kwargs: Any,
     ) -> Any:
         """Make the variable without a model; parameters are theta, steps, inputs, t0 and seed."""
@@ -215,7 +218,10 @@ class StateSpace(Continuous):
             pt.cast(p, dtype) if isinstance(p, Variable) else pt.as_tensor(np.asarray(p, dtype))
             for p, dtype in zip(params, dtypes, strict=True)
         ]
-        settings = {"system": system, "filter": filter, "score_from": score_from, "clock": clock}
+        settings = {
+            "system": system, "filter": filter, "score_from": score_from, "clock": clock,
+            "timed": timed,
+        }  # fmt: skip
         return super().dist(symbols, **settings, **kwargs)
 
     @classmethod
@@ -226,13 +232,16 @@ class StateSpace(Continuous):
         filter: Filter,
         score_from: int,
         clock: Clock,
+        timed: tuple[TimedInputs, ...],
         rng: Any = None,
         **kwargs: Any,
     ) -> TensorVariable:
         """Apply the operation; called by PyMC."""
         rng = pt.random.shared_rng(seed=None) if rng is None else rng
         kind = PanelRV if params[1].type.ndim == 2 else StateSpaceRV
-        operation = kind(system=system, filter=filter, score_from=score_from, clock=clock)
+        operation = kind(
+            system=system, filter=filter, score_from=score_from, clock=clock, timed=timed
+        )
         _, draw = operation(*params, rng=rng, return_next_rng=True, **kwargs)
         return draw
 

@@ -14,6 +14,7 @@ from pytensor.tensor.random.op import RandomVariable
 from ..filters.protocol import Filter
 from ..system.clock import Clock
 from ..system.model import StateSpaceModel
+from ..system.timed_inputs import TimedInputs
 
 NUMBERS = Clock()
 
@@ -22,13 +23,14 @@ class StateSpaceRV(RandomVariable):
     """Draws data (J, p) from theta, steps, inputs and t0; its last input, the seed, is unused.
 
     The log-density leaves out the terms of the first ``score_from`` rows. ``clock`` turns model
-    times into those of the user, for results.
+    times into those of the user, for results; ``timed`` are the inputs of each record as the user
+    gave them, if with times of their own, for forecasts.
     """
 
     name = "StateSpace"
     signature = "(k),(j),(s,u),(),()->(j,p)"
     dtype = "float64"
-    __props__ = (*RandomVariable.__props__, "system", "filter", "score_from", "clock")
+    __props__ = (*RandomVariable.__props__, "system", "filter", "score_from", "clock", "timed")
     _print_name = ("StateSpace", "\\operatorname{StateSpace}")
 
     def __init__(
@@ -38,12 +40,14 @@ class StateSpaceRV(RandomVariable):
         filter: Filter,
         score_from: int = 0,
         clock: Clock = NUMBERS,
+        timed: tuple[TimedInputs, ...] = (),
         **settings: Any,
     ) -> None:
         self.system = system
         self.filter = filter
         self.score_from = score_from
         self.clock = clock
+        self.timed = timed
         super().__init__(**settings)
 
     def __str__(self) -> str:

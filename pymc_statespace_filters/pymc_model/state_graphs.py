@@ -24,6 +24,7 @@ from ..ops.likelihood import LogLikelihood, TapedLogLikelihood
 from ..ops.states import Predictions, States, TermHealth
 from ..system.clock import Clock
 from ..system.model import StateSpaceModel
+from ..system.timed_inputs import TimedInputs
 from .inspection import state_space_nodes
 
 
@@ -32,7 +33,7 @@ class StateSpaceVariable(NamedTuple):
 
     ``dims`` names time and observables; theta and inputs may depend on the free variables. Terms of
     the rows before ``score_from`` do not count. The variable of a panel has theta (G, k) and rows
-    (J, 3), see `system.panel`, as steps.
+    (J, 3), see `system.panel`, as steps. ``timed`` are the inputs of each record that have times.
     """
 
     name: str
@@ -47,6 +48,7 @@ class StateSpaceVariable(NamedTuple):
     observed: TensorVariable
     score_from: int
     clock: Clock
+    timed: tuple[TimedInputs, ...] = ()
 
     @property
     def is_panel(self) -> bool:
@@ -66,7 +68,7 @@ def observed_variables(model: pm.Model) -> list[StateSpaceVariable]:
             op = node.op
             found.append(
                 StateSpaceVariable(
-                    name, op.system, op.filter, dims, *record, op.score_from, op.clock
+                    name, op.system, op.filter, dims, *record, op.score_from, op.clock, op.timed
                 )
             )
     return found

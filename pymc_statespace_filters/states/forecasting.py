@@ -14,11 +14,11 @@ from ..pymc_model.inspection import given_model
 from ..pymc_model.state_graphs import observed_variables
 from ..system.checks import check_random_seed, is_integer
 from ..system.model import StateSpaceModel
-from ..system.panel import of_each_record
+from ..system.panel import inputs_with_times
 from ..system.placement import check_takes
 from ..system.steps import GRID_TOLERANCE, check_steps
 from ..system.time_axis import TimeAxis, TimesBetween, axis_of, check_increasing, is_grid
-from ..system.timed_inputs import check_inputs_at, timed_inputs, times_of_inputs
+from ..system.timed_inputs import check_inputs_at, timed_inputs
 from .draws import select_draws
 from .groups import add_group, join_rows, row_coords, state_dims
 from .record import Array, RecordAtDraws
@@ -61,7 +61,9 @@ def forecast(
         Inputs from step 0 on, past and future, row k during step k; required if those of the model
         end before the last step. Of a panel also an array for each record, as in `StateSpace`.
     input_times, inputs_at
-        Times of the rows of `inputs`, and what inputs are between them, as in `StateSpace`.
+        Times of the rows of `inputs`, and what inputs are between them, as in `StateSpace`. Inputs
+        of the model with times of their own go on with their last value where no others are given,
+        and hold up to the first time of others.
 
     Returns
     -------
@@ -164,12 +166,11 @@ def _timed_inputs(
     """The inputs of each record if they have times of their own, and when they change."""
     check_inputs_at(inputs_at)
     records, variable = at_draws.records, at_draws.variable
+    if inputs is None and input_times is None and variable.timed:
+        held = [one.held_on() for one in variable.timed]
+        return [(one, one.changes()) for one in held]
     labels = [record.label for record in records]
-    own_inputs, own_times = of_each_record("inputs", inputs, labels), None
-    if input_times is not None:
-        own_times = of_each_record("input_times", input_times, labels)
-    if variable.clock.unit is not None:
-        own_times = times_of_inputs(own_inputs, own_times)
+    own_inputs, own_times = inputs_with_times(inputs, input_times, labels, variable.clock)
     if own_times is None:
         return [(None, np.empty(0))] * len(records)
     system, clock = variable.system, variable.clock
@@ -177,6 +178,11 @@ def _timed_inputs(
         timed_inputs(own, times, inputs_at, system, clock, record.number)
         for own, times, record in zip(own_inputs, own_times, records, strict=True)
     ]
+    if variable.timed:
+        found = [
+            earlier.followed_by(one) if one.times[0] > record.t0 else one
+            for earlier, one, record in zip(variable.timed, found, records, strict=True)
+        ]
     return [(one, one.changes()) for one in found]
 
 

@@ -17,10 +17,10 @@ from ..pymc_model.inspection import given_model
 from ..pymc_model.state_graphs import observed_variables
 from ..system.checks import check_flag, check_random_seed, shortened
 from ..system.model import StateSpaceModel
-from ..system.panel import of_each_record
+from ..system.panel import inputs_with_times
 from ..system.placement import Placement, Timing, place_by
 from ..system.record import check_inputs, check_observed
-from ..system.timed_inputs import check_inputs_at, times_of_inputs
+from ..system.timed_inputs import check_inputs_at
 from .draws import SAMPLE_DIMS, select_draws
 from .groups import add_group, by_record, join_rows, row_coords, state_dims
 from .record import Array, RecordAtDraws, simulate_observations
@@ -214,13 +214,10 @@ def _placed(
     if steps is not None and times is not None:
         raise ModelError("give at most one of steps and times, got both")
     check_inputs_at(inputs_at)
-    labels = [record.label for record in records]
-    own_inputs = of_each_record("inputs", inputs, labels)
-    own_times: Any = None
-    if input_times is not None:
-        own_times = of_each_record("input_times", input_times, labels)
-    if variable.clock.unit is not None:
-        own_times = times_of_inputs(own_inputs, own_times)
+    is_elsewhere = steps is not None or times is not None
+    if inputs is None and is_elsewhere and variable.timed:
+        inputs_at = variable.timed[0].rule
+    own_inputs, own_times = _inputs_of_records(at_draws, inputs, input_times, is_elsewhere)
     found = []
     for record, rows, row_times in zip(
         records, own_inputs, own_times or [None] * len(records), strict=True
@@ -243,8 +240,29 @@ def _placed(
             None if at is None else [at], None if at is not None else [times], record.t0, None,
             [rows], None if row_times is None else [row_times], inputs_at,
         )  # fmt: skip
-        found.append(place_by(variable.clock, record.t0, system, timing, [record.number]))
+        one = place_by(variable.clock, record.t0, system, timing, [record.number])
+        if one.inputs[0] is None and system.n_inputs and one.system.is_at_any_times:
+            raise ModelError(
+                f"{record.prefix}inputs must be given, with input_times, at these times, whose "
+                "steps are not those of the model's inputs, got None"
+            )
+        found.append(one)
     return found
+
+
+def _inputs_of_records(
+    at_draws: VariableAtDraws, inputs: Any, input_times: Any, is_elsewhere: bool
+) -> tuple[list[Any], list[Any] | None]:
+    """The inputs of each record and their times; None if they are by step.
+
+    The steps between times other than the model's are others, and so are the rows of its inputs.
+    """
+    variable, records = at_draws.variable, at_draws.records
+    if inputs is None and is_elsewhere and variable.timed:
+        pairs = list(zip(records, variable.timed, strict=True))
+        return [one.values for _, one in pairs], [r.shown(one.times) for r, one in pairs]
+    labels = [record.label for record in records]
+    return inputs_with_times(inputs, input_times, labels, variable.clock)
 
 
 def _measured(record: RecordAtDraws, observed: Any, steps: NDArray[np.int64]) -> Array:

@@ -28,6 +28,7 @@ from .panel_records import FIRST_INPUT, STEP, Records, records_of
 from .placement import Earlier, Placement, Timing, place
 from .record import check_inputs, check_observed, inputs_of_other_shape
 from .time_axis import TimeAxis
+from .timed_inputs import TimedInputs, times_of_inputs
 
 
 def of_each_record(name: str, values: Any, labels: Sequence[Any]) -> list[Any]:
@@ -37,6 +38,21 @@ def of_each_record(name: str, values: Any, labels: Sequence[Any]) -> list[Any]:
     """
     own = None if list(labels) == [None] else _own_inputs(values, labels, name)
     return [values] * len(labels) if own is None else own
+
+
+def inputs_with_times(
+    inputs: Any, input_times: Any, labels: Sequence[Any], clock: Clock
+) -> tuple[list[Any], list[Any] | None]:
+    """The inputs of each record, and their times: those given, else their own dates.
+
+    None for inputs by step.
+    """
+    own_inputs, own_times = of_each_record("inputs", inputs, labels), None
+    if input_times is not None:
+        own_times = of_each_record("input_times", input_times, labels)
+    if clock.unit is not None:
+        own_times = times_of_inputs(own_inputs, own_times)
+    return own_inputs, own_times
 
 
 def _own_inputs(inputs: Any, labels: Sequence[Any], name: str = "inputs") -> list[Any] | None:
@@ -175,6 +191,7 @@ class SymbolicPanel(NamedTuple):
     rows: Any
     observed: Any
     inputs: Any
+    timed: tuple[TimedInputs, ...]
 
     @property
     def t0(self) -> float:
@@ -217,7 +234,7 @@ def checked_panel(
         data = np.full((int(records.starts[-1]), system.p), np.nan)
     else:
         data = _check_observed(observed, system, records)
-    rows_of_user = placed.inputs if placed.has_timed_inputs else inputs
+    rows_of_user = placed.inputs if placed.timed else inputs
     forces, first_inputs = panel_inputs(rows_of_user, placed.system, records, placed.axes)
     number, at = records.of_rows(), np.concatenate([axis.steps for axis in placed.axes])
     begin = np.zeros_like(at) if first_inputs is None else first_inputs[number]
@@ -293,7 +310,7 @@ def symbolic_panel(
             "panel and steps must be numbers for a system with accumulators, which are reset at the"
             " steps of each record, and at times off the grid, got pm.Data"
         )
-    rows_of_user = placed.inputs if placed.has_timed_inputs else inputs
+    rows_of_user = placed.inputs if placed.timed else inputs
     forces, first_inputs = symbolic_panel_inputs(rows_of_user, system, records, axes)
     if isinstance(panel, Variable):
         codes: Any = pt.cast(panel, "int64")
@@ -309,7 +326,9 @@ def symbolic_panel(
     rows: Any = pt.stack([pt.cast(pt.as_tensor(column), "int64") for column in columns], axis=1)
     if not any(isinstance(part, Variable) for part in (panel, steps, first_inputs)):
         rows = rows.eval(mode="FAST_COMPILE")
-    return SymbolicPanel(system, placed.clock, axes, records, n_records, rows, data, forces)
+    return SymbolicPanel(
+        system, placed.clock, axes, records, n_records, rows, data, forces, placed.timed
+    )
 
 
 def _current(value: Any) -> Any:

@@ -18,7 +18,7 @@ from .time_axis import (
     is_grid,
     off_grid,
 )
-from .timed_inputs import check_inputs_at, timed_inputs, times_of_inputs
+from .timed_inputs import TimedInputs, check_inputs_at, timed_inputs, times_of_inputs
 
 
 class Earlier(NamedTuple):
@@ -70,15 +70,15 @@ class Timing(NamedTuple):
 class Placement(NamedTuple):
     """The axis of each record, and its inputs by step, as the user gave them or from their times.
 
-    ``system`` is the one at any times where an axis is not a grid; ``has_timed_inputs`` says
-    whether the inputs had times.
+    ``system`` is the one at any times where an axis is not a grid; ``timed`` are
+    the inputs of each record that have times of their own, if they do.
     """
 
     system: StateSpaceModel
     clock: Clock
     axes: list[TimeAxis]
     inputs: list[Any]
-    has_timed_inputs: bool = False
+    timed: tuple[TimedInputs, ...] = ()
 
 
 def _one_by_one(check: Callable[..., Any], *parts: Sequence[Any]) -> list[Any]:
@@ -156,7 +156,7 @@ def place_by(
     if timed is None:
         return Placement(system, clock, axes, timing.inputs)
     rows = check_each(lambda g, one, axis: one.rows(axis, clock, g), numbers, timed, axes)
-    return Placement(system, clock, axes, rows, has_timed_inputs=True)
+    return Placement(system, clock, axes, rows, tuple(timed))
 
 
 def _times_from(t0: float, given: Any, dt: float, clock: Clock, record: int) -> np.ndarray:

@@ -20,6 +20,7 @@ from .labels import columns_in_order
 from .model import StateSpaceModel
 from .placement import Earlier, Timing, place
 from .time_axis import TimeAxis
+from .timed_inputs import TimedInputs
 
 
 class CheckedRecord(NamedTuple):
@@ -104,6 +105,7 @@ class SymbolicRecord(NamedTuple):
     steps: Any
     observed: Any
     inputs: Any
+    timed: tuple[TimedInputs, ...]
 
 
 def symbolic_record(
@@ -132,6 +134,7 @@ def symbolic_record(
         steps,
         None if observed is None else _symbolic_observed(observed, system, axis.steps),
         _symbolic_inputs(rows, placed.system, steps, axis),
+        placed.timed,
     )
 
 

@@ -1,7 +1,8 @@
 """Inputs with times of their own, as rows of inputs for the steps of a record."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,8 @@ from .time_axis import TimeAxis, check_increasing
 INPUTS_AT = ("hold", "linear")
 
 
-class TimedInputs(NamedTuple):
+@dataclass(frozen=True, eq=False)  # arrays are not hashable, and a random variable holds this
+class TimedInputs:
     """Values (R, n_inputs) from ``times`` (R,) on, or linear between them; see `INPUTS_AT`.
 
     A step takes a linear input in its middle, or, where the observation at its beginning uses
@@ -33,6 +35,28 @@ class TimedInputs(NamedTuple):
         if self.rule == "linear":
             return np.empty(0)
         return self.times[1:][(np.diff(self.values, axis=0) != 0).any(axis=1)]
+
+    def held_on(self) -> "TimedInputs":
+        """The same, with a last value that holds for ever."""
+        times, values = np.append(self.times, np.inf), np.append(self.values, self.values[-1:], 0)
+        return replace(self, times=times, values=values)
+
+    def followed_by(self, later: "TimedInputs") -> "TimedInputs":
+        """These inputs up to the first of the later times, and the later ones from there on."""
+        if later.rule != self.rule:
+            raise ModelError(
+                f"inputs_at must be {self.rule!r}, as that of the model, where input_times begin "
+                f"after its start, got {later.rule!r}"
+            )
+        begin = later.times[0]
+        earlier = self.times < begin
+        times, values = self.times[earlier], self.values[earlier]
+        if self.rule == "linear":
+            before = np.nextafter(begin, -np.inf)
+            last = [np.interp(before, self.times, column) for column in self.values.T]
+            times, values = np.append(times, before), np.append(values, [last], 0)
+        times, values = np.append(times, later.times), np.append(values, later.values, 0)
+        return replace(later, times=times, values=values)
 
     def rows(self, axis: TimeAxis, clock: Clock, record: int = 0) -> np.ndarray:
         """A row for each step up to the last observation, and the one that follows it."""

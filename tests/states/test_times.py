@@ -7,6 +7,7 @@ import pytest
 import xarray as xr
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.errors import ModelError
 from tests.states.models import posterior
 from tests.system.test_times import DATA, DATES, DAYS, DRIVEN, EXACT, NOISE, THETA, exact_terms
 
@@ -111,6 +112,38 @@ def test_inputs_with_times_in_a_model_and_in_its_future():
     run = psf.free_run(idata, model, times=[1.0, 2.5], **forces)["free_run"]
     expected = np.array([0.9 + 0.3, start + 0.9 + 1.0])
     np.testing.assert_allclose(run["d"][0, 0, :, 0], expected, rtol=1e-12)
+    # Other times have other steps, of which the model's inputs give the rows.
+    run = psf.free_run(idata, model, times=[0.8, 1.0])["free_run"]
+    np.testing.assert_allclose(run["d"][0, 0, :, 0], [0.8, 1.2], rtol=1e-12)
+
+
+def test_rows_of_inputs_are_not_those_of_other_steps():
+    with pm.Model() as model:
+        pm.Normal("a")
+        record = {"steps": [1, 2], "observed": [0.5, 1.0], "inputs": [1.0, 1.0, 1.0]}
+        psf.StateSpace("d", DRIVEN, psf.EKF(), **record)
+    with pytest.raises(ModelError, match="inputs must be given, with input_times"):
+        psf.free_run(posterior(a=np.zeros((2, 2))), model, times=[0.3, 0.9])
+
+
+@pytest.mark.parametrize("inputs_at", ["hold", "linear"])
+def test_inputs_with_times_go_on_in_a_forecast(inputs_at):
+    with pm.Model() as model:
+        pm.Normal("a")
+        psf.StateSpace(
+            "d", DRIVEN, psf.EKF(), times=[0.7, 2.0], observed=[0.6, 1.0],
+            inputs=[3.0, 3.0, 5.0], input_times=[0.0, 2.0, 2.3], inputs_at=inputs_at,
+        )  # fmt: skip
+    idata = posterior(a=np.zeros((2, 2)))
+    on = psf.forecast(idata, model, times=[2.3, 2.5], random_seed=1)["predictions"]["d_states"]
+    first = 6.0 + 0.3 * (3.0 if inputs_at == "hold" else 4.0)
+    np.testing.assert_allclose(on[0, 0, :, 0], [first, first + 0.2 * 5.0], rtol=1e-9)
+    others = {"inputs": [1.0, 1.0], "input_times": [2.0, 3.0], "inputs_at": inputs_at}
+    on = psf.forecast(idata, model, times=[2.5], random_seed=1, **others)["predictions"]
+    np.testing.assert_allclose(on["d_states"], 6.0 + 0.5, rtol=1e-9)
+    others["inputs_at"] = "linear" if inputs_at == "hold" else "hold"
+    with pytest.raises(ModelError, match="as that of the model"):
+        psf.forecast(idata, model, times=[2.5], random_seed=1, **others)
 
 
 def test_a_panel_has_the_dates_of_each_record():
