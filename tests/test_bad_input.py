@@ -276,7 +276,7 @@ RECORDS = {
     "truths": (dict(steps=[False, True]), "steps .*integers"),
     "a number": (dict(steps=3, observed=[0.0]), "steps .*vector"),
     "off the grid": (dict(steps=None, times=[0.0, 1.5]), r"times\[1\] = .*1.5.*off the grid"),
-    "before the start": (dict(steps=None, times=[-1.0, 1.0]), "negative"),
+    "before the start": (dict(steps=None, times=[-1.0, 1.0]), "before t0"),
     "times not finite": (dict(steps=None, times=[0.0, np.nan]), "times .*finite"),
     "times not numbers": (dict(steps=None, times=["now", "then"]), "times must be numbers"),
     "dates": (
