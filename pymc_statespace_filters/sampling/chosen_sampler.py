@@ -68,8 +68,8 @@ def sample(
         Default: the model of the ``with`` block. Its free variables must be continuous.
     until_ess : float or "auto", optional
         Effective draws of every parameter over all chains, of the bulk and of the tails, with R-hat
-        of at most 1.01 (1 + 2 / draws for fewer than 200). Default: 400, or half of the draws that
-        are kept if these are fewer than 800. None keeps the first ``draws`` iterations.
+        of at most 1.01. If fewer than n = 800 draws are kept in all, the limit is 1 + 8 / n.
+        Default: 400, or n / 2 if that is less. None keeps the first ``draws`` iterations.
     max_draws : int, optional
         Iterations of each chain at most. Default: 1024 times ``draws`` with the random walk, 64
         times with NUTS. The run also ends where the next doubling would take it beyond five

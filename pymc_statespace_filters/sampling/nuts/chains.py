@@ -122,10 +122,11 @@ def _followed(
             is_over = _is_finished(sampler)
             if not is_over and (not made or min(made) < request.tune + length.n_iterations):
                 continue
-            positions = _positions(sampler.inspect())[:, : length.n_iterations]
-            found = convergence(list(positions[:, length.thin - 1 :: length.thin]))
+            positions = _positions(sampler.inspect())
+            rows = slice(length.thin - 1, length.n_iterations, length.thin)
+            found = convergence(list(positions[:, rows]))
             longer = next_length(request, length, found, time.monotonic() - began)
-            if longer is None or is_over:
+            if longer is None or (is_over and _n_made(positions) < longer.n_iterations):
                 break
             length = longer
             for i in range(request.chains):
@@ -147,12 +148,16 @@ def _positions(trace: DataTree) -> Array:
     return np.asarray(trace["posterior"].dataset["position"])
 
 
+def _n_made(positions: Array) -> int:
+    """Draws that all chains have made."""
+    return int(np.isfinite(positions).all(axis=(0, 2)).sum())
+
+
 def _kept(trace: DataTree, length: Length, found: Convergence | None, seconds: float) -> NutsChains:
     """Every ``thin``-th draw of a trace, as far as all chains have come."""
     rows = slice(length.thin - 1, length.n_iterations, length.thin)
     positions = _positions(trace)
-    is_made = np.isfinite(positions).all(axis=(0, 2))
-    rows = slice(rows.start, min(rows.stop, int(is_made.sum())), rows.step)
+    rows = slice(rows.start, min(rows.stop, _n_made(positions)), rows.step)
     stats = trace["sample_stats"].dataset
     statistics = {
         kept: stats[name].values[:, rows] for name, kept in STATISTICS.items() if name in stats

@@ -53,7 +53,7 @@ from .population_search import (
 )
 from .record_chain import chain_of
 from .request import SamplingRequest
-from .stopping import Length, first_length, is_enough, next_length, remedy_of, shows
+from .stopping import ENOUGH, Length, first_length, is_enough, next_length, remedy_of, shows
 from .thinned_draws import Thinning
 
 # Draws of each chain from which diagnostics are computed while chains run; of ten parameters this
@@ -435,7 +435,7 @@ class ModelTask:
         if not check_convergence:
             return []
         enough = float(ENOUGH_PER_CHAIN * request.chains)
-        if found is not None and not shows(request, enough) and not found.reaches(enough):
+        if found is not None and not shows(request, ENOUGH) and not found.reaches(enough):
             return [few_draws_warning(found, names, request.chains * request.draws)]
         warning = mixing_warning(found, names, enough, n, self._seconds, ways)
         return [] if warning is None else [warning]
