@@ -7,8 +7,6 @@ from xarray import DataTree
 
 from ...pymc_model.density import ModelDensity
 from ...pymc_model.posterior_draws import noise_was_moved, unconstrained_draws
-from ...unvisited.check import MOST_PARAMETERS
-from ...unvisited.sentences import store, unvisited
 from .warnings import sampler_warning
 
 # CPU seconds: so many, or this share of the time of the run if that is more.
@@ -24,6 +22,10 @@ def unvisited_warnings(
 
     The outcome is stored with the draws. Chains that held one noise seed are not checked.
     """
+    # They load SciPy's statistics, which would take a third of the time to import a sampler.
+    from ...unvisited.check import MOST_PARAMETERS
+    from ...unvisited.sentences import store, unvisited
+
     posterior = tree["posterior"]
     if posterior.sizes["chain"] * posterior.sizes["draw"] < _LEAST_DRAWS:
         return []
