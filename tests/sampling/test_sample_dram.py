@@ -413,7 +413,9 @@ def test_convergence_is_judged_if_it_is_asked_for(asked, caplog):
     call = {"tune": 0, "compute_convergence_checks": asked}
     sample_dram(simple_model(), draws=99, **call)
     assert ("The chains have not mixed" in caplog.text) == asked
-    sample_dram(simple_model(), draws=100, **with_kernel({"proposal_cov": 1e12 * np.eye(2)}), **call)
+    sample_dram(
+        simple_model(), draws=100, **with_kernel({"proposal_cov": 1e12 * np.eye(2)}), **call
+    )
     assert caplog.text.count("Chains 0 and 1: DRAM accepted 0 of 100") == 1
 
 
