@@ -31,7 +31,7 @@ def ends(comm):
         if comm.rank == 0:
             patch.setattr(ChainTask, "run", _fails_when_others_are_done)
         with pytest.raises((ArithmeticError, psf.errors.ParallelError)) as caught:
-            psf.sample_dram(**quick, progressbar=False, comm=psf.Ranks(None, gather="all"))
+            psf.sample_dram(**quick | {"comm": psf.Ranks(comm, gather="all")}, progressbar=False)
     heard.append(str(caught.value))
 
     made, told = ChainTask._advance, []
@@ -49,10 +49,9 @@ def ends(comm):
         tree = psf.sample_dram(
             10**5,
             tune=0,
-            **call,
+            **call | {"comm": psf.Ranks(comm, gather="all")},
             progressbar=False,
             kernel=psf.RandomWalkSettings(proposal_cov=[[1.0]]),
-            comm=psf.Ranks(None, gather="all"),
         )
     heard.append(dict(tree["posterior"].sizes))
     return heard
