@@ -68,6 +68,20 @@ def label_axes(collection: PlotCollection, names: Sequence[str], time: str) -> N
     lowest = panels.isel({dim: slice(-n_columns, None)})
     settings = {"ignore_aes": "all", "store_artist": False}
     collection.map(labelled_x, data=lowest, text=time, **settings)
+    shorten_dates(collection)
+
+
+def shorten_dates(collection: PlotCollection) -> None:
+    """Shorten dates below an axis, which touch each other in matplotlib."""
+    if collection.backend != "matplotlib":
+        return
+    from matplotlib.dates import AutoDateFormatter, AutoDateLocator, ConciseDateFormatter
+
+    for axes in collection.viz["figure"].item().axes:
+        if isinstance(axes.xaxis.get_major_formatter(), AutoDateFormatter):
+            locator = AutoDateLocator(maxticks=N_TICKS)
+            axes.xaxis.set_major_locator(locator)
+            axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))
 
 
 def label_y(da: xr.DataArray, target: Any, *, texts: xr.DataArray, **kwargs: Any) -> Any:

@@ -26,6 +26,7 @@ from .canvas import (
     label_ticks,
     legend_style,
     logarithmic_ticks,
+    shorten_dates,
     time_label,
 )
 from .marks import bars, draw_bands, draw_median, over_draws, point_size, points
@@ -165,6 +166,7 @@ def plot_filter_health(
         legend |= _draw_effective(collection, data[["effective"]])
         _note_failures(collection, data[["effective"]], idata)
     _label_panels(collection, data, time_label(residual))
+    shorten_dates(collection)
     add_legend(collection, legend, n_observables > 1)
     return collection
 

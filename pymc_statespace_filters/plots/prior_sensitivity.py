@@ -15,6 +15,7 @@ from .canvas import add_legend, band, canvas, curve, interval, logarithmic_ticks
 
 ENDS = ("width_prob_low", "width_prob_high")
 LABEL_WIDTH, NOTE_WIDTH = 44, 32  # characters, of a line below the panel and inside it
+LINE = 0.22  # inches, of a line below a panel
 
 
 def plot_prior_sensitivity(
@@ -66,12 +67,13 @@ def plot_prior_sensitivity(
     found = curves.assign_coords(width=np.log10(curves["width"]))
     probs = found[["width_prob"]]
     low, high = (found[[name]].rename({name: "width_prob"}) for name in ENDS)
+    width, height = size_of_panels(1)
     collection = canvas(
         probs,
         backend=backend,
         pc_kwargs=pc_kwargs,
         aes={"color": ["model"]},
-        size=size_of_panels(1),
+        size=(width, height + LINE * _about_priors(probs).count("\n")),
         n_panels=1,
         cols=["__variable__"],
     )

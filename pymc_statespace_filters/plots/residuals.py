@@ -18,6 +18,7 @@ from .canvas import (
     few_ticks,
     interval,
     label_x,
+    shorten_dates,
     time_label,
     unit_of,
     with_unit,
@@ -135,6 +136,7 @@ def plot_residuals(
         for one in found.z["observable"].values
     ]
     _label_panels(collection, panels, predicted, time_label(found.z, data))
+    shorten_dates(collection)
     add_legend(collection, {"95 % if the model is right": {**EXPECTED, "width": 8}}, n_columns > 1)
     return collection
 

@@ -10,6 +10,7 @@ from pymc.model import Model
 from xarray import DataTree
 
 from ..errors import ModelError
+from ..former_names import former_names
 from ..pymc_model.inspection import given_model
 from ..system.checks import check_flag
 from .checkpoint.checkpoint import checked_folder, folder_name
@@ -17,7 +18,7 @@ from .run.driver import sample_models
 from .run.ranks import Ranks
 from .run.request import ExecutionOptions, sampling_request
 from .run.warm_start import warm_started, warm_started_models
-from .target.settings import RandomWalkSettings, refuse_moved
+from .target.settings import FORMER_ARGUMENTS, RandomWalkSettings
 
 
 @overload
@@ -32,6 +33,7 @@ def sample_dram(
 ) -> DataTree | None: ...
 
 
+@former_names(**FORMER_ARGUMENTS)  # type: ignore[misc]  # overloads name a few arguments
 def sample_dram(
     draws: int = 1000,
     tune: int = 1000,
@@ -51,7 +53,6 @@ def sample_dram(
     compute_convergence_checks: bool = True,
     checkpoint: str | os.PathLike | None = None,
     comm: Any = None,
-    **moved: Any,
 ) -> DataTree | None:
     """Sample a model by adaptive Metropolis-Hastings, with whole chains in machine code.
 
@@ -190,7 +191,6 @@ def sample_dram(
     >>> idata["posterior"]["mu"].shape
     (2, 500)
     """
-    refuse_moved("sample_dram", moved)
     model = given_model(model)
     request = sampling_request(
         draws,
@@ -224,6 +224,7 @@ def run_models(
 ) -> dict[str, DataTree] | None: ...
 
 
+@former_names(**FORMER_ARGUMENTS)  # type: ignore[misc]  # overloads name a few arguments
 def run_models(
     models: Mapping[str, Model],
     *,
@@ -243,7 +244,6 @@ def run_models(
     compute_convergence_checks: bool = True,
     checkpoint: str | os.PathLike | None = None,
     comm: Any = None,
-    **moved: Any,
 ) -> dict[str, DataTree] | None:
     """Sample several models in one run, each as by `sample_dram`.
 
@@ -296,7 +296,6 @@ def run_models(
     >>> {name: tree["posterior"]["mu"].shape for name, tree in trees.items()}
     {'narrow': (4, 200), 'wide': (4, 200)}
     """
-    refuse_moved("run_models", moved)
     if not isinstance(models, Mapping) or not models:
         raise ModelError(
             f"models must be a non-empty mapping of names to pymc.Model, got {models!r}"

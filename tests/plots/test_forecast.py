@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.dates import ConciseDateFormatter
 
 from pymc_statespace_filters import plot_forecast
 from pymc_statespace_filters.errors import ModelError
@@ -166,6 +167,8 @@ def test_errors_at_dates(forecast):
         for one in (forecast, dated)
     ]
     np.testing.assert_array_equal(*(one["speed"]["y"] for one in found))
+    axes = plot_forecast(dated, backend="matplotlib").viz["figure"].item().axes
+    assert isinstance(axes[0].xaxis.get_major_formatter(), ConciseDateFormatter)
     with pytest.raises(ModelError, match=r"predictions, 2020-01-01T00:00:03\.1\d* to .*got none"):
         plot_forecast(dated, errors=True)
 

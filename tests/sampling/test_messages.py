@@ -182,7 +182,7 @@ def test_a_wrong_argument_is_named(call, arguments, message):
     ("arguments", "error", "message"),
     [
         ({"progressbar": "wide"}, ValueError, r"Invalid value for `progressbar`"),
-        ({"step": None}, TypeError, r"unexpected keyword argument 'step'$"),
+        ({"step": None}, TypeError, r"unexpected keyword argument 'step'"),
     ],
 )
 def test_other_errors(arguments, error, message):

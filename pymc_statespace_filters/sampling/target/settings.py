@@ -2,7 +2,6 @@
 
 import math
 import numbers
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -13,7 +12,6 @@ from ...pymc_model.inspection import is_filter
 from ...system.checks import check_count, is_integer
 
 ADAPTATIONS = ("chain", "continuous")
-_OF_RANKS = {"ranks_per_chain": "per_chain", "gather": "gather"}
 
 
 @dataclass(frozen=True)
@@ -123,15 +121,14 @@ class RandomWalkSettings:
             )
 
 
-def refuse_moved(caller: str, arguments: Mapping[str, Any]) -> None:
-    """Raise a TypeError that says where an argument has moved to, or that there is none."""
-    for name in arguments:
-        place = ""
-        if name in (field.name for field in fields(RandomWalkSettings)):
-            place = f": it is a setting of kernel=psf.RandomWalkSettings({name}=...)"
-        elif name in _OF_RANKS:
-            place = f": it is a setting of comm=psf.Ranks({_OF_RANKS[name]}=...)"
-        raise TypeError(f"{caller}() got an unexpected keyword argument {name!r}{place}")
+# What samplers once had as arguments of their own.
+FORMER_ARGUMENTS = {
+    field.name: f"give kernel=psf.RandomWalkSettings({field.name}=...)"
+    for field in fields(RandomWalkSettings)
+} | {
+    "ranks_per_chain": "give comm=psf.Ranks(per_chain=...)",
+    "gather": "give comm=psf.Ranks(gather=...)",
+}
 
 
 def checked_proposal_cov(proposal_cov: object, dim: int | None = None) -> np.ndarray:
