@@ -81,14 +81,20 @@ def correlated_target(dim, *, smallest_sd, largest_sd, correlation, seed):
 
 
 @BOTH
-def test_covariance_is_that_of_the_draws(adapt):
+@pytest.mark.parametrize(
+    ("every", "first_counts"),
+    [(1, 3**2), (13, 0.2 * 3)],
+    ids=["its proposals are accepted", "too wide"],
+)
+def test_covariance_is_that_of_the_draws(adapt, every, first_counts):
     """Once a block moves, C = 2.38^2 / d COV, up to the blend with the first covariance."""
     rng = np.random.default_rng(0)
     dim, n = 3, 100
     positions = rng.normal(size=(n, dim)) @ np.tril(rng.normal(size=(dim, dim)))
-    state = feed(adapt, start_adaptation(np.eye(dim)), positions, np.ones(n))
+    accepted = np.arange(n) % every == 0
+    state = feed(adapt, start_adaptation(np.eye(dim)), positions, accepted)
 
-    weight = n / (n + dim**2)
+    weight = accepted.sum() / (accepted.sum() + first_counts)
     learnt = 2.38**2 / dim * np.cov(positions.T, bias=True)
     np.testing.assert_allclose(state.cov, weight * learnt + (1 - weight) * np.eye(dim), rtol=1e-4)
     np.testing.assert_allclose(state.chol @ state.chol.T, state.cov, rtol=1e-12)

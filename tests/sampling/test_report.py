@@ -173,3 +173,14 @@ def test_chains_below_what_the_search_has_met_never_reached_the_posterior(report
     assert re.match(r"The chains never reached the posterior: .* stayed 10\d nats", said)
     _, _, messages = report_of(state_space_model(psf.BootstrapPF(200)), draws=50, tune=400)
     assert "never reached" not in "".join(messages)
+
+
+def test_a_few_high_points_do_not_tell_that_the_chains_never_reached_the_posterior(report_of):
+    """In the neck of a funnel the density has no bound, and there is hardly any mass."""
+    with pm.Model() as schools:
+        tau = pm.HalfCauchy("tau", 5)
+        theta = pm.Normal("theta", pm.Normal("mu", 0, 5), tau, shape=8)
+        errors = [15, 10, 16, 11, 9, 11, 10, 18]
+        pm.Normal("y", theta, errors, observed=[28, 8, -3, 7, -1, 1, 18, 12])
+    _, _, messages = report_of(schools, draws=300, tune=1000)
+    assert "never reached" not in "".join(messages)
