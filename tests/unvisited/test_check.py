@@ -93,3 +93,20 @@ def test_draws_that_do_not_vary_in_every_direction_are_left_alone():
     draws, log_density, evaluate = drawn(Correlated(3), 1, n=500)
     for wrong in (draws * [1.0, 1.0, 0.0], draws[..., [0, 1, 1]]):
         assert missed_tails(wrong, log_density, evaluate, ALL, np.random.default_rng(1)) == []
+
+
+def test_the_share_of_the_posterior_in_a_tail_is_that_of_exact_draws():
+    """Of a normal distribution, also in the widest tail, where Z is that of all draws."""
+    rng = np.random.default_rng(5)
+    draws = rng.standard_normal((4, 5000, 2))
+
+    def log_density(x, rng=None):
+        return -0.5 * (x**2).sum(axis=-1)
+
+    log_evidence = check._bridged(draws, log_density(draws), log_density, 8000, rng)
+    tail = check._tail(draws, 0, 1, 0.2)
+    inside = draws[tail.distance(draws) > 0]
+    points = check.weighted_points(tail, inside, log_density, 1.0, rng)
+    found = check._compared(tail, draws, points, log_evidence)
+    assert found.posterior == pytest.approx(0.2, abs=0.01)  # three standard errors
+    assert abs(found.errors) < 3
