@@ -54,8 +54,8 @@ def choose_sampler(model: Model, chains: int, tune: int) -> Choice:
             return Choice(DRAM, reason)
     return Choice(
         quicker,
-        f"{dim} parameters and {1e3 * cost:.2g} ms a log-density: about {seconds[DRAM]:.2g} CPU s "
-        f"by DRAM and {seconds[NUTS]:.2g} by NUTS",
+        f"{dim} parameter{'s' * (dim > 1)}, {1e3 * cost:.2g} ms for a log-density: about "
+        f"{seconds[DRAM]:.2g} CPU s by DRAM and {seconds[NUTS]:.2g} by NUTS",
     )
 
 

@@ -205,7 +205,7 @@ def test_the_choice():
     assert kinked == ("dram", "the equations of 'd' have kinks or jumps")
     few, many = (choice.choose_sampler(linear_model(n), 4, 1000) for n in (3, 200))
     assert (few.sampler, many.sampler) == ("dram", "nuts")
-    assert few.reason.startswith("3 parameters and ")
+    assert few.reason.startswith("3 parameters, ")
 
 
 def test_what_decides_is_the_dimension_and_the_cost():
