@@ -24,11 +24,11 @@ release = version = installed_version(project)
 
 extensions = [
     "gallery",  # docs/gallery.py
+    "mathml",  # docs/mathml.py
     "myst_nb",
     "numpydoc",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
-    "sphinx.ext.mathjax",
     "sphinx_copybutton",
     "sphinx_design",
 ]
@@ -67,6 +67,7 @@ html_theme = (
 html_title = "pymc-statespace-filters"
 html_static_path = ["_static"]
 html_css_files = ["guide.css"]
+html_math_renderer = "mathml"
 html_sidebars = {"index": [], "start": [], "thesis": []}
 html_show_sourcelink = False
 html_theme_options = {

@@ -1,4 +1,4 @@
-"""Built pages that show the machine which built them: its paths, warnings of its environment."""
+"""Built pages that show the machine which built them, or need another server to be shown."""
 
 import sys
 from collections.abc import Iterator
@@ -7,8 +7,15 @@ from pathlib import Path
 from sphinx.application import Sphinx
 from sphinx.util import logging
 
-# What paths of packages and cells contain, and warnings of packages that a notebook lacks.
-TRACES = ("site-packages", "ipykernel_", "ipywidgets", "IProgress")
+# What paths of packages and cells contain, warnings of packages that a notebook lacks, and scripts
+# and pictures of other servers.
+TRACES = (
+    "site-packages",
+    "ipykernel_",
+    "ipywidgets",
+    "IProgress",
+    'src="http',
+)
 
 
 def report(app: Sphinx, exception: Exception | None) -> None:
@@ -18,7 +25,9 @@ def report(app: Sphinx, exception: Exception | None) -> None:
     own = (str(Path(app.srcdir).parent), sys.prefix)
     for page, traces in found(Path(app.outdir), (*own, *TRACES)):
         logging.getLogger(__name__).warning(
-            "%s shows the machine that built it: %s", page, ", ".join(traces)
+            "%s shows the machine that built it, or needs another: %s",
+            page,
+            ", ".join(traces),
         )
 
 

@@ -6,12 +6,14 @@ import sys
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
 from tests.waiting import LIMIT
 
 pytest.importorskip("myst_nb")  # the newest releases are tested without those of the guide
+nodes = pytest.importorskip("docutils.nodes")
 
 ROOT = Path(__file__).parents[1]
 CONF = """
@@ -102,6 +104,23 @@ def test_notebooks_run_again_if_the_package_has_changed(guide, first):
     assert build(guide).returncode == 0
     assert (guide / "runs").read_text() == "ran\nran\n"
     assert len(list((guide / ".cache" / "notebooks").iterdir())) == 1
+
+
+@pytest.mark.parametrize("displayed", [False, True])
+def test_formulas_are_mathml_or_a_warning(displayed, monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    mathml = import_module("mathml")
+    log = Mock()
+    monkeypatch.setattr(mathml, "LOG", log)
+    text = r"a &= \frac12 \\ b &= 2" if displayed else r"\frac12"
+    found = mathml.markup(nodes.math(text, text), displayed=displayed)
+    assert found.startswith("<math")
+    assert "<mn>1</mn><mn>2</mn></mfrac>" in found
+    assert found.count("<mtr>") == 2 * displayed
+    log.warning.assert_not_called()
+    wrong = nodes.math("", r"\wrong<")
+    assert mathml.markup(wrong, displayed=displayed) == r"<code>\wrong&lt;</code>"
+    log.warning.assert_called_once()
 
 
 def test_pages_that_show_the_machine_are_named(tmp_path, monkeypatch):
