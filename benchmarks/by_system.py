@@ -22,6 +22,7 @@ from benchmarks.by_system_records import Case, cases
 from pymc_statespace_filters.filters.recommendation import check_system_and_filter
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.parameters import flat_parameters
 from pymc_statespace_filters.system.record import checked_record
 
@@ -87,7 +88,7 @@ def measure(case: Case, filter, exact: float) -> Cell:
     run = evaluator(LogLikelihood(case.system, filter))
     given = flat_parameters(case.system, case.given)
     record = checked_record(
-        case.system, case.observed, steps=case.steps, inputs=case.inputs
+        case.system, GivenRecord(case.observed, steps=case.steps, inputs=case.inputs)
     ).arguments
     totals = []
     run(given, *record, np.asarray(N_SEEDS))  # compiles

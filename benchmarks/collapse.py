@@ -16,6 +16,7 @@ from benchmarks.by_system_records import Case, cases
 from pymc_statespace_filters.filters.outcomes import COLLAPSED
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.parameters import flat_parameters
 from pymc_statespace_filters.system.record import checked_record
 
@@ -32,7 +33,7 @@ def errors_and_warnings(case: Case, filter, exact: float) -> tuple[np.ndarray, n
     run = evaluator(LogLikelihood(case.system, filter))
     given = flat_parameters(case.system, case.given)
     record = checked_record(
-        case.system, case.observed, steps=case.steps, inputs=case.inputs
+        case.system, GivenRecord(case.observed, steps=case.steps, inputs=case.inputs)
     ).arguments
     found = [run(given, *record, np.asarray(seed))[:2] for seed in range(N_SEEDS)]
     error = np.array([terms.sum() for terms, _ in found]) - exact

@@ -15,6 +15,7 @@ import pytensor.tensor as pt
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.parameters import flat_parameters
 from pymc_statespace_filters.system.record import checked_record
 from pymc_statespace_filters.testing import kalman_log_likelihood
@@ -214,5 +215,8 @@ def counts(*, a=0.8, bend=0.0, level=0.0, noise_var=0.2, initial_mean=0.0, initi
 def log_likelihoods(system, filter, params, seeds, **record):
     """Total log-likelihoods (n_seeds,) of a filter with noise, without a warning."""
     run = evaluator(LogLikelihood(system, filter))
-    arguments = (flat_parameters(system, params), *checked_record(system, **record).arguments)
+    arguments = (
+        flat_parameters(system, params),
+        *checked_record(system, GivenRecord(**record)).arguments,
+    )
     return np.array([run(*arguments, seed)[0].sum() for seed in seeds])

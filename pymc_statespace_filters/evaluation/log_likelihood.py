@@ -18,6 +18,7 @@ from ..ops.distributed import check_ranks, distributed_evaluator
 from ..ops.likelihood import LogLikelihood
 from ..parallel.communicator import Communicator, communicator_of
 from ..system.checks import check_count
+from ..system.given_record import GivenRecord
 from ..system.model import StateSpaceModel
 from ..system.panel import CheckedPanel, checked_panel
 from ..system.parameters import flat_parameters, panel_parameters
@@ -110,15 +111,12 @@ def log_likelihood(
     """
     check_system_and_filter(system, filter)
     warn_of_choice(system, filter)
-    data = {
-        "steps": steps, "times": times, "inputs": inputs, "t0": t0, "unit": unit,
-        "input_times": input_times, "inputs_at": inputs_at,
-    }  # fmt: skip
+    given = GivenRecord(observed, panel, steps, times, inputs, t0, unit, input_times, inputs_at)
     if panel is not None:
-        return _of_panel(system, filter, params, panel, observed, data, seed, comm, cores)
+        return _of_panel(system, filter, params, given, seed, comm, cores)
     if check_count("cores", cores, 1) > 1:
         raise ModelError(f"cores must be 1 without a panel, whose records it divides, got {cores}")
-    placed = checked_record(system, observed, **data)
+    placed = checked_record(system, given)
     system, record = placed.system, placed.arguments
     theta = flat_parameters(system, params)
     seeds = check_seed("seed", seed)
@@ -146,9 +144,7 @@ def _of_panel(
     system: StateSpaceModel,
     filter: Filter,
     params: Any,
-    panel: Any,
-    observed: Any,
-    data: dict[str, Any],
+    given: GivenRecord,
     seed: Any,
     comm: Any,
     cores: Any,
@@ -156,7 +152,7 @@ def _of_panel(
     n_threads = check_count("cores", cores, 1)
     if comm is not None:
         raise ModelError("comm must be None for a panel: every rank evaluates all records")
-    table = checked_panel(system, panel, observed, **data)
+    table = checked_panel(system, given)
     system = table.system
     theta = panel_parameters(system, params, table.records)
     seeds = check_seed("seed", seed)

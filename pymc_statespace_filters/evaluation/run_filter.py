@@ -16,6 +16,7 @@ from ..filters.recommendation import check_system_and_filter
 from ..ops.base import evaluator
 from ..ops.states import FilterRun, ResumableRun
 from ..system.clock import Clock
+from ..system.given_record import GivenRecord
 from ..system.model import StateSpaceModel
 from ..system.panel import CheckedPanel, checked_panel
 from ..system.parameters import flat_parameters, panel_parameters
@@ -124,16 +125,14 @@ def run_filter(
     noise = check_seed("seed", seed)
     if noise.ndim:
         raise ModelError(f"run_filter takes one seed, got an array of {noise.shape}")
-    data = {
-        "steps": steps, "times": times, "inputs": inputs, "t0": t0, "unit": unit,
-        "input_times": input_times, "inputs_at": inputs_at,
-    }  # fmt: skip
+    given = GivenRecord(observed, panel, steps, times, inputs, t0, unit, input_times, inputs_at)
+    earlier = None
     if state is not None:
-        system, data["earlier"] = _earlier(system, state)
+        system, earlier = _earlier(system, state)
     labels = None
     table: CheckedRecord | CheckedPanel
     if panel is None:
-        table = checked_record(system, observed, **data)
+        table = checked_record(system, given, earlier)
         theta = flat_parameters(system, params)
         if theta.ndim != 1:
             raise ModelError(
@@ -141,7 +140,7 @@ def run_filter(
             )
         arguments: list[Any] = [(theta, *table.arguments, noise)]
     else:
-        table = checked_panel(system, panel, observed, **data)
+        table = checked_panel(system, given, earlier)
         labels = table.records.labels
         of_records = panel_parameters(system, params, table.records)
         seeds = seeds_of_records(noise, table.records.codes)

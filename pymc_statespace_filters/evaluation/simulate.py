@@ -20,6 +20,7 @@ from ..errors import ModelError
 from ..parallel.signals import held_interrupts
 from ..progress import slow_compilation
 from ..system.checks import check_flag, check_random_seed
+from ..system.given_record import GivenRecord
 from ..system.model import StateSpaceModel
 from ..system.panel import checked_panel
 from ..system.parameters import flat_parameters, panel_parameters
@@ -297,13 +298,10 @@ def simulate(
     {'row': 72, 'state': 1, 'obs': 5, 'observable': 1}
     """
     check_system(system)
-    data = {
-        "steps": steps, "times": times, "inputs": inputs, "t0": t0, "unit": unit,
-        "input_times": input_times, "inputs_at": inputs_at,
-    }  # fmt: skip
+    given = GivenRecord(None, panel, steps, times, inputs, t0, unit, input_times, inputs_at)
     if panel is not None:
-        return _simulate_panel(system, params, panel, data, noise, random_seed)
-    record = checked_record(system, None, **data)
+        return _simulate_panel(system, params, given, noise, random_seed)
+    record = checked_record(system, given)
     system, (at, _, forces, _) = record.system, record.arguments
     theta = flat_parameters(system, params)
     if theta.ndim != 1:
@@ -340,13 +338,12 @@ def _run(run: Callable, rng: np.random.Generator, theta: np.ndarray, steps: Any,
 def _simulate_panel(
     system: StateSpaceModel,
     params: Mapping[str, Any],
-    panel: Any,
-    data: Mapping[str, Any],
+    given: GivenRecord,
     noise: bool,
     random_seed: Any,
 ) -> xr.Dataset:
     """Simulate every record with a generator of its own."""
-    table = checked_panel(system, panel, None, **data)
+    table = checked_panel(system, given)
     system = table.system
     theta = panel_parameters(system, params, table.records)
     run = simulator(system, check_flag("noise", noise)).function

@@ -18,6 +18,7 @@ from ..filters.protocol import Filter
 from ..filters.recommendation import check_system_and_filter
 from ..system.checks import is_integer
 from ..system.clock import Clock
+from ..system.given_record import GivenRecord
 from ..system.model import StateSpaceModel
 from ..system.panel import SymbolicPanel, symbolic_panel
 from ..system.parameters import check_names, symbolic_panel_parameters, symbolic_parameters
@@ -153,25 +154,22 @@ class StateSpace(Continuous):
             raise ModelError(f"name must be a text that is not empty, got {name!r}")
         check_system_and_filter(system, filter)
         warn_of_choice(system, filter)
-        given = {} if params is None else params
-        check_names(system, given)
-        values = dict(system.defaults) | _model_variables(system, model) | dict(given)
+        own = {} if params is None else params
+        check_names(system, own)
+        values = dict(system.defaults) | _model_variables(system, model) | dict(own)
         others = tuple(model.named_vars)
         full_name = model.name_for(name)
         _check_name(model, full_name, name, system)
-        data = {
-            "steps": steps, "times": times, "inputs": inputs, "t0": t0, "unit": unit,
-            "input_times": input_times, "inputs_at": inputs_at,
-        }  # fmt: skip
+        given = GivenRecord(observed, panel, steps, times, inputs, t0, unit, input_times, inputs_at)
         record: Any
         if panel is None:
             theta = symbolic_parameters(system, values, others)
-            record = symbolic_record(system, observed, **data)
+            record = symbolic_record(system, given)
             n_rows, t0 = record.axis.steps.size, record.axis.t0
             row_dim, component_dim = _dims(dims, f"{full_name}_time")
             row_coords: Any = record.clock.shown(record.axis.times(record.axis.steps))
         else:
-            record = symbolic_panel(system, panel, observed, **data)
+            record = symbolic_panel(system, given)
             theta = symbolic_panel_parameters(system, values, record, others)
             n_rows, t0 = int(np.diff(record.records.starts).max()), record.t0
             row_dim, component_dim = _dims(dims, f"{full_name}_obs")

@@ -3,6 +3,7 @@
 import logging
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,7 @@ from .checkpoint.checkpoint import checked_folder
 from .choice import DRAM, NUTS, Choice, choose_sampler, why_no_nuts
 from .run.continuation import appended, former_chains
 from .run.driver import sample_models
-from .run.ranks import Ranks
-from .run.request import ExecutionOptions, SamplingRequest, sampling_request
+from .run.request import RunArguments, SamplingRequest
 from .run.stopping import AUTO, target_ess
 from .target.settings import RandomWalkSettings
 
@@ -138,14 +138,17 @@ def sample(
         chains=chains,
         tune=tune,
     )
-    request = _request(
-        choice.sampler, draws, tune, chains, random_seed, initvals, until_ess, max_draws, kernel
-    )
+    given = RunArguments(
+        draws=draws, tune=tune, until_ess=until_ess, max_draws=max_draws, chains=chains,
+        cores=cores, random_seed=random_seed, initvals=initvals, kernel=kernel,
+        progressbar=progressbar,
+    )  # fmt: skip
+    request = _request(choice.sampler, given)
     if continue_from is not None:
         request = _continued(request, continue_from, model)
     level = logging.INFO if progressbar else logging.DEBUG
     _log.log(level, "%s: %s", _NAMES[choice.sampler], choice.reason)
-    options = ExecutionOptions(cores, progressbar, True, Ranks.of(comm))
+    options = given.options(comm)
     tree: DataTree | None
     if choice.sampler == NUTS:
         from .nuts.sample_nuts import sample_nuts  # nutpie takes longer to import than the rest
@@ -185,24 +188,12 @@ def _choice(
     return choose_sampler(model, chains, tune)
 
 
-def _request(
-    sampler: str,
-    draws: int,
-    tune: int,
-    chains: int,
-    random_seed: Any,
-    initvals: Any,
-    until_ess: float | str | None,
-    max_draws: int | None,
-    kernel: RandomWalkSettings | None,
-) -> SamplingRequest:
-    until_ess = target_ess(until_ess, draws, chains)
-    request = sampling_request(
-        draws, tune, chains, random_seed, initvals, False, until_ess, max_draws, kernel
-    )
+def _request(sampler: str, given: RunArguments) -> SamplingRequest:
+    until_ess = target_ess(given.until_ess, given.draws, given.chains)
+    request = replace(given, until_ess=until_ess).request()
     if until_ess is None:
         return request
-    most = max_draws or _MOST_THIN[sampler] * draws
+    most = given.max_draws or _MOST_THIN[sampler] * given.draws
     return request._replace(max_draws=most, doubles_thin=True, seconds=TIME_LIMIT)
 
 

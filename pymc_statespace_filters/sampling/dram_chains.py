@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, overload
 
@@ -12,11 +13,9 @@ from xarray import DataTree
 from ..errors import ModelError
 from ..former_names import former_names
 from ..pymc_model.inspection import given_model
-from ..system.checks import check_flag
 from .checkpoint.checkpoint import checked_folder, folder_name
 from .run.driver import sample_models
-from .run.ranks import Ranks
-from .run.request import ExecutionOptions, sampling_request
+from .run.request import RunArguments
 from .run.warm_start import warm_started, warm_started_models
 from .target.settings import FORMER_ARGUMENTS, RandomWalkSettings
 
@@ -192,21 +191,16 @@ def sample_dram(
     (2, 500)
     """
     model = given_model(model)
-    request = sampling_request(
-        draws,
-        tune,
-        chains,
-        random_seed,
-        initvals,
-        not check_flag("discard_tuned_samples", discard_tuned_samples),
-        until_ess,
-        max_draws,
-        kernel,
-        thin,
-    )
+    given = RunArguments(
+        draws=draws, tune=tune, until_ess=until_ess, max_draws=max_draws, thin=thin,
+        chains=chains, cores=cores, random_seed=random_seed, initvals=initvals, kernel=kernel,
+        progressbar=progressbar, discard_tuned_samples=discard_tuned_samples,
+        compute_convergence_checks=compute_convergence_checks,
+    )  # fmt: skip
+    request = given.request()
     if pilot is not None:
         request = warm_started(request, model, pilot)
-    options = ExecutionOptions(cores, progressbar, compute_convergence_checks, Ranks.of(comm))
+    options = given.options(comm)
     folders = [] if checkpoint is None else [checked_folder(checkpoint)]
     trees = sample_models({"": model}, [request], options, folders)
     return None if trees is None else trees[""]
@@ -228,22 +222,10 @@ def run_models(
 def run_models(
     models: Mapping[str, Model],
     *,
-    draws: int = 1000,
-    tune: int = 1000,
-    until_ess: float | None = None,
-    max_draws: int | None = None,
-    thin: int = 1,
-    chains: int = 4,
-    cores: int | None = None,
-    random_seed: int | np.random.Generator | None = None,
-    initvals: Mapping[str, Any] | None = None,
     pilot: DataTree | Mapping[str, DataTree] | None = None,
-    kernel: RandomWalkSettings | None = None,
-    progressbar: bool | str = True,
-    discard_tuned_samples: bool = True,
-    compute_convergence_checks: bool = True,
     checkpoint: str | os.PathLike | None = None,
     comm: Any = None,
+    **settings: Any,
 ) -> dict[str, DataTree] | None:
     """Sample several models in one run, each as by `sample_dram`.
 
@@ -253,19 +235,20 @@ def run_models(
     Parameters
     ----------
     models : mapping of str to pymc.Model
-    draws, tune, until_ess, max_draws, thin, chains, cores, random_seed, initvals
-        As in `sample_dram`, for every model. A model's draws are those of `sample_dram` with the
-        same seed and do not depend on the other models; with ``until_ess`` each stops on its own.
     pilot : xarray.DataTree, or mapping of str to xarray.DataTree, optional
         As in `sample_dram`, of the models with these names. A single one is the pilot of every
         model that has a free variable in common with it.
-    kernel, progressbar, discard_tuned_samples, compute_convergence_checks
-        As in `sample_dram`.
     checkpoint : str or path, optional
         A folder with a subfolder for each model. If the process ends for any reason, the same call
         resumes the run.
     comm
         As in `sample_dram`.
+    **settings
+        The other arguments of `sample_dram`, for every model: ``draws``, ``tune``, ``until_ess``,
+        ``max_draws``, ``thin``, ``chains``, ``cores``, ``random_seed``, ``initvals``, ``kernel``,
+        ``progressbar``, ``discard_tuned_samples``, ``compute_convergence_checks``. A model's draws
+        are those of `sample_dram` with the same seed and do not depend on the other models; with
+        ``until_ess`` each stops on its own.
 
     Returns
     -------
@@ -305,20 +288,14 @@ def run_models(
             raise ModelError(f"names of models must be non-empty strings, got {name!r}")
         if not isinstance(model, Model):
             raise ModelError(f"models[{name!r}] must be a pymc.Model, got {model!r}")
-    request = sampling_request(
-        draws,
-        tune,
-        chains,
-        random_seed,
-        initvals,
-        not check_flag("discard_tuned_samples", discard_tuned_samples),
-        until_ess,
-        max_draws,
-        kernel,
-        thin,
-    )
-    requests = warm_started_models(request, models, pilot)
-    options = ExecutionOptions(cores, progressbar, compute_convergence_checks, Ranks.of(comm))
+    if unknown := settings.keys() - {field.name for field in fields(RunArguments)}:
+        raise TypeError(
+            f"run_models() has no argument {min(unknown)!r}: beside models, pilot, checkpoint and "
+            "comm it takes those of sample_dram, without model"
+        )
+    given = RunArguments(**settings)
+    requests = warm_started_models(given.request(), models, pilot)
+    options = given.options(comm)
     folders = []
     if checkpoint is not None:
         folder = checked_folder(checkpoint)

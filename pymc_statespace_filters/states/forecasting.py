@@ -13,8 +13,8 @@ from ..evaluation.simulate import continuation
 from ..pymc_model.inspection import given_model
 from ..pymc_model.state_graphs import observed_variables
 from ..system.checks import check_random_seed, is_integer
+from ..system.given_record import inputs_with_times
 from ..system.model import StateSpaceModel
-from ..system.panel import inputs_with_times
 from ..system.placement import check_takes
 from ..system.steps import GRID_TOLERANCE, check_steps
 from ..system.time_axis import TimeAxis, TimesBetween, axis_of, check_increasing, is_grid

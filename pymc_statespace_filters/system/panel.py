@@ -9,83 +9,31 @@ The code of a record is its label, or a hash of it if that is a text. The noise 
 on the seed and this code alone, so that it does not change when other records are added.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 import pytensor.tensor as pt
-import xarray as xr
 from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
-from .checks import shortened
-from .clock import Clock, are_dates
+from .clock import Clock
+from .given_record import GivenRecord, own_inputs
 from .model import StateSpaceModel
 from .panel_records import FIRST_INPUT, STEP, Records, records_of
-from .placement import Earlier, Placement, Timing, place
-from .record import check_inputs, check_observed, inputs_of_other_shape
+from .placement import Earlier
+from .record import check_inputs, checked_data, inputs_of_other_shape, symbolic_data
 from .time_axis import TimeAxis
-from .timed_inputs import TimedInputs, times_of_inputs
-
-
-def of_each_record(name: str, values: Any, labels: Sequence[Any]) -> list[Any]:
-    """The inputs of each record, or their times: their own, or the same for all.
-
-    A single record has the label None.
-    """
-    own = None if list(labels) == [None] else _own_inputs(values, labels, name)
-    return [values] * len(labels) if own is None else own
-
-
-def inputs_with_times(
-    inputs: Any, input_times: Any, labels: Sequence[Any], clock: Clock
-) -> tuple[list[Any], list[Any] | None]:
-    """The inputs of each record, and their times: those given, else their own dates.
-
-    None for inputs by step.
-    """
-    own_inputs, own_times = of_each_record("inputs", inputs, labels), None
-    if input_times is not None:
-        own_times = of_each_record("input_times", input_times, labels)
-    if clock.unit is not None:
-        own_times = times_of_inputs(own_inputs, own_times)
-    return own_inputs, own_times
-
-
-def _own_inputs(inputs: Any, labels: Sequence[Any], name: str = "inputs") -> list[Any] | None:
-    """The inputs of each record, if they have their own: a mapping or a sequence of arrays."""
-    if isinstance(inputs, Mapping):
-        if set(inputs) != set(labels):
-            missing = [label for label in labels if label not in inputs]
-            raise ModelError(
-                f"{name} must have an array for each record, got none for {shortened(missing)}"
-                if missing
-                else f"{name} must have an array for each record, got others: {shortened(inputs)}"
-            )
-        return [inputs[label] for label in labels]
-    is_list = isinstance(inputs, list | tuple) and all(
-        isinstance(part, np.ndarray | Variable | pd.Series | pd.DataFrame | xr.DataArray)
-        and part.ndim
-        for part in inputs
-    )
-    if not is_list and not (isinstance(inputs, np.ndarray) and inputs.ndim == 3):
-        return None
-    if len(inputs) != len(labels):
-        raise ModelError(
-            f"{name} must have an array for each of the {len(labels)} records, or one for "
-            f"all, got {len(inputs)}"
-        )
-    return list(inputs)
+from .timed_inputs import TimedInputs
 
 
 def panel_inputs(
     inputs: Any, system: StateSpaceModel, records: Records, axes: Sequence[TimeAxis]
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """All rows of inputs, and the first row of each record; None if all share them."""
-    own = _own_inputs(inputs, records.labels)
+    own = own_inputs(inputs, records.labels)
     if own is None:
         # Lengths of steps, and observations that reset accumulators, are those of one record.
         if system.n_input_columns == system.n_inputs:
@@ -105,7 +53,7 @@ def symbolic_panel_inputs(
     inputs: Any, system: StateSpaceModel, records: Records, axes: Sequence[TimeAxis]
 ) -> tuple[Any, Any]:
     """The same for symbols, of which what is known is checked."""
-    own = _own_inputs(inputs, records.labels)
+    own = own_inputs(inputs, records.labels)
     parts = [inputs] if own is None else own
     if not any(isinstance(part, Variable) for part in parts):
         return panel_inputs(inputs, system, records, axes)
@@ -212,29 +160,13 @@ def times_of_records(
 
 
 def checked_panel(
-    system: StateSpaceModel,
-    panel: Any,
-    observed: Any,
-    *,
-    steps: Any = None,
-    times: Any = None,
-    inputs: Any = None,
-    t0: Any = 0.0,
-    unit: Any = None,
-    input_times: Any = None,
-    inputs_at: Any = "hold",
-    earlier: Earlier | None = None,
+    system: StateSpaceModel, given: GivenRecord, earlier: Earlier | None = None
 ) -> CheckedPanel:
     """Check every part of a panel of numbers; ``observed`` is None for a simulation."""
-    records = records_of(panel)
-    placed = _placed(
-        system, records, steps, times, inputs, t0, unit, input_times, inputs_at, earlier
-    )
-    if observed is None:
-        data = np.full((int(records.starts[-1]), system.p), np.nan)
-    else:
-        data = _check_observed(observed, system, records)
-    rows_of_user = placed.inputs if placed.timed else inputs
+    records = records_of(given.panel)
+    placed = given.placed(system, records, earlier)
+    data = checked_data(given.observed, system, int(records.starts[-1]))
+    rows_of_user = placed.inputs if placed.timed else given.inputs
     forces, first_inputs = panel_inputs(rows_of_user, placed.system, records, placed.axes)
     number, at = records.of_rows(), np.concatenate([axis.steps for axis in placed.axes])
     begin = np.zeros_like(at) if first_inputs is None else first_inputs[number]
@@ -242,67 +174,12 @@ def checked_panel(
     return CheckedPanel(placed.system, placed.clock, records, placed.axes, rows, data, forces)
 
 
-def _placed(
-    system: StateSpaceModel,
-    records: Records,
-    steps: Any,
-    times: Any,
-    inputs: Any,
-    t0: Any,
-    unit: Any,
-    input_times: Any,
-    inputs_at: Any,
-    earlier: Earlier | None = None,
-) -> Placement:
-    """The axes of the records; with times of their own, also the inputs by step of each."""
-    if (steps is None) == (times is None):
-        raise ModelError("give exactly one of steps and times")
-    if isinstance(times, Variable):
-        raise ModelError("times must be numbers, got a symbol; give steps=pm.Data(...) instead")
-    own_inputs, own_times = of_each_record("inputs", inputs, records.labels), None
-    if input_times is not None:
-        own_times = of_each_record("input_times", input_times, records.labels)
-        if any(isinstance(part, Variable) for part in own_inputs):
-            raise ModelError("inputs must be numbers where input_times are given, got a symbol")
-    timing = Timing(
-        _by_record("steps", steps, records),
-        _by_record("times", times, records),
-        t0, unit, own_inputs, own_times, inputs_at, earlier,
-    )  # fmt: skip
-    return place(system, timing, records.check_each)
-
-
-def _by_record(name: str, values: Any, records: Records) -> list[Any] | None:
-    if values is None:
-        return None
-    array = values if are_dates(values) else np.asarray(values)
-    n_rows = int(records.starts[-1])
-    if np.shape(array) != (n_rows,):
-        raise ModelError(
-            f"{name} must have shape ({n_rows},), one for each row of panel, got shape "
-            f"{np.shape(array)}"
-        )
-    return [array[rows] for rows in records.slices()]
-
-
-def symbolic_panel(
-    system: StateSpaceModel,
-    panel: Any,
-    observed: Any,
-    *,
-    steps: Any,
-    times: Any,
-    inputs: Any,
-    t0: Any,
-    unit: Any,
-    input_times: Any,
-    inputs_at: Any,
-) -> SymbolicPanel:
+def symbolic_panel(system: StateSpaceModel, given: GivenRecord) -> SymbolicPanel:
     """Check every part of a panel as far as it is known: numbers and the values of shared data."""
-    records = records_of(_current(panel))
-    current = _current(steps)
-    placed = _placed(system, records, current, times, inputs, t0, unit, input_times, inputs_at)
-    data = None if observed is None else _symbolic_observed(observed, system, records)
+    panel, steps, current = given.panel, given.steps, given.current()
+    records = records_of(current.panel)
+    placed = current.placed(system, records)
+    data = symbolic_data(given.observed, system, int(records.starts[-1]))
     system, axes = placed.system, placed.axes
     is_symbolic = isinstance(panel, Variable) or isinstance(steps, Variable)
     if is_symbolic and system.n_input_columns > system.n_inputs:
@@ -310,7 +187,7 @@ def symbolic_panel(
             "panel and steps must be numbers for a system with accumulators, which are reset at the"
             " steps of each record, and at times off the grid, got pm.Data"
         )
-    rows_of_user = placed.inputs if placed.timed else inputs
+    rows_of_user = placed.inputs if placed.timed else given.inputs
     forces, first_inputs = symbolic_panel_inputs(rows_of_user, system, records, axes)
     if isinstance(panel, Variable):
         codes: Any = pt.cast(panel, "int64")
@@ -329,25 +206,3 @@ def symbolic_panel(
     return SymbolicPanel(
         system, placed.clock, axes, records, n_records, rows, data, forces, placed.timed
     )
-
-
-def _current(value: Any) -> Any:
-    return value.eval() if isinstance(value, Variable) else value
-
-
-def _check_observed(observed: Any, system: StateSpaceModel, records: Records) -> np.ndarray:
-    return check_observed(observed, system, int(records.starts[-1]))
-
-
-def _symbolic_observed(observed: Any, system: StateSpaceModel, records: Records) -> Variable:
-    if not isinstance(observed, Variable):
-        # A symbol, because PyMC would mask and impute the NaN of an array.
-        return pt.as_tensor(_check_observed(observed, system, records))
-    if observed.type.ndim != 2:
-        raise ModelError(
-            f"observed must have 2 dimensions (rows, observables) if it is symbolic, got "
-            f"{observed.type.ndim}"
-        )
-    if isinstance(observed, SharedVariable):
-        _check_observed(observed.get_value(), system, records)
-    return observed

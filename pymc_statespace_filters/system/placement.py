@@ -81,12 +81,13 @@ class Placement(NamedTuple):
     timed: tuple[TimedInputs, ...] = ()
 
 
-def _one_by_one(check: Callable[..., Any], *parts: Sequence[Any]) -> list[Any]:
+def one_by_one(check: Callable[..., Any], *parts: Sequence[Any]) -> list[Any]:
+    """Check what each record has, where records need no name."""
     return [check(*own) for own in zip(*parts, strict=True)]
 
 
 def place(
-    system: StateSpaceModel, timing: Timing, check_each: Callable[..., list[Any]] = _one_by_one
+    system: StateSpaceModel, timing: Timing, check_each: Callable[..., list[Any]] = one_by_one
 ) -> Placement:
     """Find the steps of some records; ``check_each`` calls a check for each, see `Records`."""
     check_inputs_at(timing.inputs_at)
@@ -116,7 +117,7 @@ def place_by(
     system: StateSpaceModel,
     timing: Timing,
     numbers: Sequence[int],
-    check_each: Callable[..., list[Any]] = _one_by_one,
+    check_each: Callable[..., list[Any]] = one_by_one,
 ) -> Placement:
     """The same by a clock that is known, for the records of these numbers."""
     timed, input_times = None, timing.input_times

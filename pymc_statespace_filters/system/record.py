@@ -6,7 +6,6 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 import pytensor.tensor as pt
 from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Variable
@@ -14,11 +13,12 @@ from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
 from .checks import check_floats, shortened
-from .clock import Clock, times_of_data
+from .clock import Clock
+from .given_record import GivenRecord
 from .input_columns import n_input_rows, with_columns, with_symbolic_columns
 from .labels import columns_in_order
 from .model import StateSpaceModel
-from .placement import Earlier, Timing, place
+from .placement import Earlier
 from .time_axis import TimeAxis
 from .timed_inputs import TimedInputs
 
@@ -46,54 +46,14 @@ class CheckedRecord(NamedTuple):
 
 
 def checked_record(
-    system: StateSpaceModel,
-    observed: Any,
-    *,
-    steps: Any = None,
-    times: Any = None,
-    inputs: Any = None,
-    t0: Any = 0.0,
-    unit: Any = None,
-    input_times: Any = None,
-    inputs_at: Any = "hold",
-    earlier: Earlier | None = None,
+    system: StateSpaceModel, given: GivenRecord, earlier: Earlier | None = None
 ) -> CheckedRecord:
     """Check every part of a record of numbers; ``observed`` is None for a simulation."""
-    times = _times(observed, steps, times)
-    timing = _timing(steps, times, t0, unit, inputs, input_times, inputs_at)
-    placed = place(system, timing._replace(earlier=earlier))
+    placed = given.placed(system, earlier=earlier)
     (axis,), (rows,) = placed.axes, placed.inputs
-    if observed is None:
-        data = np.full((axis.steps.size, system.p), np.nan)
-    else:
-        data = check_observed(observed, system, axis.steps.size)
+    data = checked_data(given.observed, system, axis.steps.size)
     rows = check_inputs(rows, placed.system, axis)
     return CheckedRecord(placed.system, placed.clock, axis, data, rows)
-
-
-def _times(observed: Any, steps: Any, times: Any) -> Any:
-    """The times of a record: those given, else the dates that the data bring."""
-    if steps is not None or times is not None:
-        return times
-    found = times_of_data(observed)
-    if found is None and isinstance(observed, pd.Series | pd.DataFrame):
-        raise ModelError(
-            "give exactly one of steps and times, or dates as the index of observed (read text with"
-            f" pd.to_datetime): it holds no dates, got {shortened(observed.index)}"
-        )
-    return found
-
-
-def _timing(
-    steps: Any, times: Any, t0: Any, unit: Any, inputs: Any, input_times: Any, inputs_at: Any
-) -> Timing:
-    """The timing of a single record."""
-    if isinstance(times, Variable):
-        raise ModelError("times must be numbers, got a symbol; give steps=pm.Data(...) instead")
-    if input_times is not None and isinstance(inputs, Variable):
-        raise ModelError("inputs must be numbers where input_times are given, got a symbol")
-    at, own = ([value] if value is not None else None for value in (times, input_times))
-    return Timing(None if steps is None else [steps], at, t0, unit, [inputs], own, inputs_at)
 
 
 class SymbolicRecord(NamedTuple):
@@ -108,47 +68,36 @@ class SymbolicRecord(NamedTuple):
     timed: tuple[TimedInputs, ...]
 
 
-def symbolic_record(
-    system: StateSpaceModel,
-    observed: Any,
-    *,
-    steps: Any,
-    times: Any,
-    inputs: Any,
-    t0: Any,
-    unit: Any,
-    input_times: Any,
-    inputs_at: Any,
-) -> SymbolicRecord:
+def symbolic_record(system: StateSpaceModel, given: GivenRecord) -> SymbolicRecord:
     """Check every part of a record as far as it is known: numbers and the values of shared data."""
-    times = _times(observed, steps, times)
-    is_symbolic = isinstance(steps, Variable)
-    current = steps.eval() if is_symbolic else steps
-    placed = place(system, _timing(current, times, t0, unit, inputs, input_times, inputs_at))
+    placed = given.current().placed(system)
     (axis,), (rows,) = placed.axes, placed.inputs
-    steps = steps if is_symbolic else axis.steps
+    steps = given.steps if isinstance(given.steps, Variable) else axis.steps
     return SymbolicRecord(
         placed.system,
         placed.clock,
         axis,
         steps,
-        None if observed is None else _symbolic_observed(observed, system, axis.steps),
+        symbolic_data(given.observed, system, axis.steps.size),
         _symbolic_inputs(rows, placed.system, steps, axis),
         placed.timed,
     )
 
 
-def _symbolic_observed(observed: Any, system: StateSpaceModel, steps: np.ndarray) -> Variable:
+def symbolic_data(observed: Any, system: StateSpaceModel, n_rows: int) -> Variable | None:
+    """The data (J, p) as a symbol, if there are any; of a symbol, what is known is checked."""
+    if observed is None:
+        return None
     if not isinstance(observed, Variable):
         # A symbol, because PyMC would mask and impute the NaN of an array.
-        return pt.as_tensor(check_observed(observed, system, steps.size))
+        return pt.as_tensor(check_observed(observed, system, n_rows))
     if observed.type.ndim != 2:
         raise ModelError(
-            f"observed must have 2 dimensions (observations, observables) if it is symbolic, "
-            f"got {observed.type.ndim}"
+            f"observed must have 2 dimensions (rows, observables) if it is symbolic, got "
+            f"{observed.type.ndim}"
         )
     if isinstance(observed, SharedVariable):
-        check_observed(observed.get_value(), system, steps.size)
+        check_observed(observed.get_value(), system, n_rows)
     return observed
 
 
@@ -186,6 +135,13 @@ def check_system(system: Any) -> None:
     """Raise unless ``system`` is a `StateSpaceModel`."""
     if not isinstance(system, StateSpaceModel):
         raise ModelError(f"system must be a StateSpaceModel, got {system!r}")
+
+
+def checked_data(observed: Any, system: StateSpaceModel, n_rows: int) -> np.ndarray:
+    """The data (J, p), all missing in a simulation."""
+    if observed is None:
+        return np.full((n_rows, system.p), np.nan)
+    return check_observed(observed, system, n_rows)
 
 
 def check_observed(observed: Any, system: StateSpaceModel, n_observations: int) -> np.ndarray:

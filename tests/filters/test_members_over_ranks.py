@@ -34,6 +34,7 @@ from pymc_statespace_filters.ops.distributed import (
     check_ranks,
     distributed_evaluator,
 )
+from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.parameters import flat_parameters
 from pymc_statespace_filters.system.record import checked_record
 from tests.filters.ensemble_contract import (
@@ -317,7 +318,7 @@ def test_counts_are_the_same_on_one_and_several_ranks():
         accumulators=["left"],
     )
     filter_, steps = BootstrapPF(200, resample_below=1), np.array([2, 4, 6])
-    record = checked_record(system, [60.0, 55.0, 70.0], steps=steps)
+    record = checked_record(system, GivenRecord([60.0, 55.0, 70.0], steps=steps))
     arguments = np.array([0.1]), *record.arguments, 5
     terms = by_evaluators(system, filter_, arguments)
     alone = psf.log_likelihood(system, filter_, {"rate": 0.1}, record.observed, steps=steps, seed=5)

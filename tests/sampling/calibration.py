@@ -27,7 +27,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.sampling.output.deterministics import Deterministics
 from pymc_statespace_filters.sampling.run.chain_task import ChainTask
 from pymc_statespace_filters.sampling.run.model_task import ModelTask
-from pymc_statespace_filters.sampling.run.request import sampling_request
+from pymc_statespace_filters.sampling.run.request import RunArguments
 from pymc_statespace_filters.sampling.target.log_density import screening_density
 from pymc_statespace_filters.sampling.target.record_target import target_of
 from pymc_statespace_filters.sampling.target.settings import RandomWalkSettings
@@ -181,7 +181,7 @@ class Replications:
         with pm.Model() as self.model:
             problem.prior()
             psf.StateSpace("d", LINEAR, setting.filter, observed=self.record, **problem.rows)
-        settings = RandomWalkSettings(**setting.dram)
+        self._kernel = settings = RandomWalkSettings(**setting.dram)
         if setting.graph:
             self._target = Target(self.model, None, settings, graph=setting.graph(self.model))
         else:
@@ -197,9 +197,9 @@ class Replications:
 
     def chain(self, index, n_draws):
         """Draws (n_draws, ...) by name: those of ``sample_dram(random_seed=index, chains=1)``."""
-        request = sampling_request(
-            n_draws, TUNE, 1, index, None, False, None, None, self._setting.dram
-        )
+        request = RunArguments(
+            draws=n_draws, tune=TUNE, chains=1, random_seed=index, kernel=self._kernel
+        ).request()
         task = ModelTask(self.model, request, target=self._target)
         with self._lock:
             self.record.set_value(self.truth_and_record(index)[1])

@@ -4,6 +4,8 @@ import gc
 import re
 import tracemalloc
 import weakref
+from dataclasses import fields
+from inspect import signature
 
 import numpy as np
 import pymc as pm
@@ -15,7 +17,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import DataMismatchError
 from pymc_statespace_filters.sampling.run import model_task
 from pymc_statespace_filters.sampling.run.model_task import ModelTask
-from pymc_statespace_filters.sampling.run.request import SamplingRequest
+from pymc_statespace_filters.sampling.run.request import RunArguments, SamplingRequest
 from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
 from pymc_statespace_filters.sampling.target import target
 from pymc_statespace_filters.sampling.target.settings import RandomWalkSettings
@@ -143,6 +145,21 @@ def test_messages_name_the_model(caplog):
     named = [re.match(r"Model '(\w+)': ", record.message) for record in caplog.records]
     assert {match.group(1) for match in named if match} == set(models)
     assert all(named)
+
+
+def test_its_arguments_are_those_of_sample_dram():
+    given = signature(psf.sample_dram).parameters
+    for field in fields(RunArguments):
+        assert given[field.name].default == field.default
+    assert given.keys() - {f.name for f in fields(RunArguments)} == {
+        "model",
+        "pilot",
+        "checkpoint",
+        "comm",
+    }
+    for name in ("drwas", "model"):
+        with pytest.raises(TypeError, match=rf"run_models\(\) has no argument '{name}'"):
+            psf.run_models({"a": normal_model()}, **{name: 1})
 
 
 def breaking(mu):

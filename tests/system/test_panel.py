@@ -5,6 +5,7 @@ import pandas as pd
 import pytest
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.panel import checked_panel
 from pymc_statespace_filters.system.panel_records import FIRST_INPUT, RECORD, STEP, records_of
 from pymc_statespace_filters.system.parameters import panel_parameters
@@ -17,7 +18,7 @@ DATA = np.arange(5.0)
 
 def panel_of(labels=LABELS, observed=DATA, steps=STEPS, inputs=FORCE, system=FORCED, **options):
     options = {"times": None, "t0": 0.0} | options
-    return checked_panel(system, labels, observed, steps=steps, inputs=inputs, **options)
+    return checked_panel(system, GivenRecord(observed, labels, steps, inputs=inputs, **options))
 
 
 def test_records_are_in_the_order_of_their_rows():

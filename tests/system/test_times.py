@@ -8,6 +8,7 @@ import xarray as xr
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.clock import clock_and_start
+from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.record import checked_record
 from pymc_statespace_filters.system.time_axis import divided_axis
 
@@ -61,8 +62,8 @@ def test_a_gap_of_whole_steps_has_so_many():
 
 
 def test_a_record_on_the_grid_has_the_system_and_the_arrays_of_its_steps():
-    by_times = checked_record(EXACT, DATA[:3], times=[0.5, 1.0 + 1e-8, 3.0])
-    by_steps = checked_record(EXACT, DATA[:3], steps=[1, 2, 6])
+    by_times = checked_record(EXACT, GivenRecord(DATA[:3], times=[0.5, 1.0 + 1e-8, 3.0]))
+    by_steps = checked_record(EXACT, GivenRecord(DATA[:3], steps=[1, 2, 6]))
     assert by_times.system is EXACT
     for one, other in zip(by_times.arguments, by_steps.arguments, strict=True):
         np.testing.assert_array_equal(one, other)
@@ -146,7 +147,7 @@ def test_an_exact_step_of_any_length_is_that_of_a_grid(stiff):
         for dt in (0.25, 0.3)
     ]
     times = 0.25 * np.array([1, 2, 5, 9])
-    records = [checked_record(system, DATA[:4], times=times) for system in systems]
+    records = [checked_record(system, GivenRecord(DATA[:4], times=times)) for system in systems]
     assert [record.system.is_at_any_times for record in records] == [False, True]
     terms = [
         psf.log_likelihood(system, psf.EKF(), {"a": 2.0}, DATA[:4], times=times)
@@ -321,8 +322,8 @@ DAYS = (DATES - DATES[0]) / np.timedelta64(1, "D")
     ids=["array", "index", "series", "zone", "xarray", "datetimes"],
 )
 def test_dates_have_the_bits_of_equal_numbers(dates):
-    placed = checked_record(EXACT, DATA, times=dates, unit="D")
-    expected = checked_record(EXACT, DATA, times=DAYS)
+    placed = checked_record(EXACT, GivenRecord(DATA, times=dates, unit="D"))
+    expected = checked_record(EXACT, GivenRecord(DATA, times=DAYS))
     for one, other in zip(placed.arguments, expected.arguments, strict=True):
         np.testing.assert_array_equal(one, other)
     np.testing.assert_array_equal(placed.times(placed.axis.steps), DATES)
@@ -388,18 +389,18 @@ def test_records_of_a_panel_start_at_their_own_first_dates():
 )
 def test_dates_that_are_refused(settings, message):
     with pytest.raises(ModelError, match=message):
-        checked_record(EXACT, DATA, **settings)
+        checked_record(EXACT, GivenRecord(DATA, **settings))
 
 
 def test_an_index_without_dates_is_named():
     for index in (DATES.astype(str), None):
         with pytest.raises(ModelError, match=r"index of observed.*pd.to_datetime.*no dates"):
-            checked_record(EXACT, pd.Series(DATA, index=index))
+            checked_record(EXACT, GivenRecord(pd.Series(DATA, index=index)))
 
 
 def test_missing_values_of_pandas_are_missing():
     series = pd.Series([1, None, 3], dtype="Int64")
-    record = checked_record(EXACT, series, steps=[0, 1, 2])
+    record = checked_record(EXACT, GivenRecord(series, steps=[0, 1, 2]))
     np.testing.assert_array_equal(record.observed[:, 0], [1.0, np.nan, 3.0])
 
 

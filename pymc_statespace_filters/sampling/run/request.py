@@ -6,7 +6,7 @@ threads, ranks and output, on which they do not depend.
 
 import math
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from importlib.metadata import version
 from typing import Any, NamedTuple
 
@@ -111,54 +111,67 @@ class ExecutionOptions(NamedTuple):
             raise ModelError(f"cores must be None or an integer of at least 1, got {self.cores!r}")
 
 
-def sampling_request(
-    draws: int,
-    tune: int,
-    chains: int,
-    random_seed: Any,
-    initvals: Any,
-    keeps_warmup: bool,
-    until_ess: Any,
-    max_draws: Any,
-    kernel: RandomWalkSettings | None,
-    thin: int = 1,
-) -> SamplingRequest:
-    """Check the arguments of ``sample_dram`` that need no model, and make a request of them.
+@dataclass(frozen=True, kw_only=True, eq=False)  # arrays are not hashable
+class RunArguments:
+    """What ``sample_dram``, ``run_models`` and ``sample`` all take, as the user gave it."""
 
-    Raises
-    ------
-    ModelError
-        If an argument is not as ``sample_dram`` describes it.
-    """
-    check_count("draws", draws, 0, _MOST_ITERATIONS)
-    check_count("tune", tune, 0, _MOST_ITERATIONS)
-    check_count("chains", chains, 1, _MOST_CHAINS)
-    check_count("thin", thin, 1, _MOST_ITERATIONS)
-    if draws + tune * keeps_warmup == 0:
-        raise ModelError(
-            f"draws must be at least 1 unless the warm-up is kept, got draws={draws}, tune={tune}, "
-            f"discard_tuned_samples={not keeps_warmup}; for the warm-up alone give "
-            "discard_tuned_samples=False"
+    draws: int = 1000
+    tune: int = 1000
+    until_ess: Any = None
+    max_draws: Any = None
+    thin: int = 1
+    chains: int = 4
+    cores: int | None = None
+    random_seed: Any = None
+    initvals: Any = None
+    kernel: RandomWalkSettings | None = None
+    progressbar: bool | str = True
+    discard_tuned_samples: bool = True
+    compute_convergence_checks: bool = True
+
+    def options(self, comm: Any) -> ExecutionOptions:
+        """How to execute the run, on the ranks of ``comm``."""
+        checks = self.compute_convergence_checks
+        return ExecutionOptions(self.cores, self.progressbar, checks, Ranks.of(comm))
+
+    def request(self) -> SamplingRequest:
+        """Check the arguments that need no model, and make a request of them.
+
+        Raises
+        ------
+        ModelError
+            If an argument is not as ``sample_dram`` describes it.
+        """
+        draws, tune = self.draws, self.tune
+        check_count("draws", draws, 0, _MOST_ITERATIONS)
+        check_count("tune", tune, 0, _MOST_ITERATIONS)
+        check_count("chains", self.chains, 1, _MOST_CHAINS)
+        check_count("thin", self.thin, 1, _MOST_ITERATIONS)
+        keeps_warmup = not check_flag("discard_tuned_samples", self.discard_tuned_samples)
+        if draws + tune * keeps_warmup == 0:
+            raise ModelError(
+                f"draws must be at least 1 unless the warm-up is kept, got draws={draws}, "
+                f"tune={tune}, discard_tuned_samples={not keeps_warmup}; for the warm-up alone "
+                "give discard_tuned_samples=False"
+            )
+        kernel = RandomWalkSettings() if self.kernel is None else self.kernel
+        if not isinstance(kernel, RandomWalkSettings):
+            raise ModelError(f"kernel must be psf.RandomWalkSettings(...), got {kernel!r}")
+        enough, most = _stopping_rule(draws, self.until_ess, self.max_draws)
+        return SamplingRequest(
+            draws,
+            tune,
+            self.chains,
+            _entropy(self.random_seed),
+            self.random_seed is not None,
+            self.initvals,
+            keeps_warmup,
+            kernel.proposal_cov,
+            replace(kernel, proposal_cov=None),
+            until_ess=enough,
+            max_draws=most,
+            thin=int(self.thin),
         )
-    if kernel is None:
-        kernel = RandomWalkSettings()
-    if not isinstance(kernel, RandomWalkSettings):
-        raise ModelError(f"kernel must be psf.RandomWalkSettings(...), got {kernel!r}")
-    enough, most = _stopping_rule(draws, until_ess, max_draws)
-    return SamplingRequest(
-        draws,
-        tune,
-        chains,
-        _entropy(random_seed),
-        random_seed is not None,
-        initvals,
-        keeps_warmup,
-        kernel.proposal_cov,
-        replace(kernel, proposal_cov=None),
-        until_ess=enough,
-        max_draws=most,
-        thin=int(thin),
-    )
 
 
 def _stopping_rule(

@@ -1,0 +1,139 @@
+"""A record, or the records of a panel, as a user gives them: the arguments are read once, here."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from pytensor.graph.basic import Variable
+
+from ..errors import ModelError
+from .checks import shortened
+from .clock import Clock, are_dates, times_of_data
+from .model import StateSpaceModel
+from .panel_records import Records
+from .placement import Earlier, Placement, Timing, place
+from .timed_inputs import times_of_inputs
+
+
+@dataclass(frozen=True, eq=False)  # arrays are not hashable
+class GivenRecord:
+    """The arguments of `StateSpace` that describe data; ``observed`` is None in a simulation."""
+
+    observed: Any = None
+    panel: Any = None
+    steps: Any = None
+    times: Any = None
+    inputs: Any = None
+    t0: Any = 0.0
+    unit: Any = None
+    input_times: Any = None
+    inputs_at: Any = "hold"
+
+    def current(self) -> "GivenRecord":
+        """The same with the current numbers of symbolic steps and labels."""
+        steps, panel = (
+            value.eval() if isinstance(value, Variable) else value
+            for value in (self.steps, self.panel)
+        )
+        return replace(self, steps=steps, panel=panel)
+
+    def placed(
+        self,
+        system: StateSpaceModel,
+        records: Records | None = None,
+        earlier: Earlier | None = None,
+    ) -> Placement:
+        """Where the observations lie, and inputs with times of their own; of a panel, by record."""
+        if isinstance(self.times, Variable):
+            raise ModelError("times must be numbers, got a symbol; give steps=pm.Data(...) instead")
+        labels = [None] if records is None else records.labels
+        inputs, input_times = of_each_record("inputs", self.inputs, labels), None
+        if self.input_times is not None:
+            input_times = of_each_record("input_times", self.input_times, labels)
+            if any(isinstance(part, Variable) for part in inputs):
+                raise ModelError("inputs must be numbers where input_times are given, got a symbol")
+        timing = Timing(
+            _by_record("steps", self.steps, records),
+            _by_record("times", self._own_times(), records),
+            self.t0, self.unit, inputs, input_times, self.inputs_at, earlier,
+        )  # fmt: skip
+        return (
+            place(system, timing) if records is None else place(system, timing, records.check_each)
+        )
+
+    def _own_times(self) -> Any:
+        """The times that are given, else the dates that the data bring."""
+        if self.steps is not None or self.times is not None:
+            return self.times
+        found = times_of_data(self.observed)
+        if found is None and isinstance(self.observed, pd.Series | pd.DataFrame):
+            raise ModelError(
+                "give exactly one of steps and times, or dates as the index of observed (read text "
+                f"with pd.to_datetime): it holds no dates, got {shortened(self.observed.index)}"
+            )
+        return found
+
+
+def _by_record(name: str, values: Any, records: Records | None) -> list[Any] | None:
+    """What each row has, as a list with the rows of each record."""
+    if values is None or records is None:
+        return None if values is None else [values]
+    array = values if are_dates(values) else np.asarray(values)
+    n_rows = int(records.starts[-1])
+    if np.shape(array) != (n_rows,):
+        raise ModelError(
+            f"{name} must have shape ({n_rows},), one for each row of panel, got shape "
+            f"{np.shape(array)}"
+        )
+    return [array[rows] for rows in records.slices()]
+
+
+def of_each_record(name: str, values: Any, labels: Sequence[Any]) -> list[Any]:
+    """The inputs of each record, or their times: their own, or the same for all.
+
+    A single record has the label None.
+    """
+    own = None if list(labels) == [None] else own_inputs(values, labels, name)
+    return [values] * len(labels) if own is None else own
+
+
+def inputs_with_times(
+    inputs: Any, input_times: Any, labels: Sequence[Any], clock: Clock
+) -> tuple[list[Any], list[Any] | None]:
+    """The inputs of each record, and their times: those given, else their own dates.
+
+    None for inputs by step.
+    """
+    own, own_times = of_each_record("inputs", inputs, labels), None
+    if input_times is not None:
+        own_times = of_each_record("input_times", input_times, labels)
+    return own, own_times if clock.unit is None else times_of_inputs(own, own_times)
+
+
+def own_inputs(inputs: Any, labels: Sequence[Any], name: str = "inputs") -> list[Any] | None:
+    """The inputs of each record, if they have their own: a mapping or a sequence of arrays."""
+    if isinstance(inputs, Mapping):
+        if set(inputs) != set(labels):
+            missing = [label for label in labels if label not in inputs]
+            raise ModelError(
+                f"{name} must have an array for each record, got none for {shortened(missing)}"
+                if missing
+                else f"{name} must have an array for each record, got others: {shortened(inputs)}"
+            )
+        return [inputs[label] for label in labels]
+    is_list = isinstance(inputs, list | tuple) and all(
+        isinstance(part, np.ndarray | Variable | pd.Series | pd.DataFrame | xr.DataArray)
+        and part.ndim
+        for part in inputs
+    )
+    if not is_list and not (isinstance(inputs, np.ndarray) and inputs.ndim == 3):
+        return None
+    if len(inputs) != len(labels):
+        raise ModelError(
+            f"{name} must have an array for each of the {len(labels)} records, or one for "
+            f"all, got {len(inputs)}"
+        )
+    return list(inputs)
