@@ -31,6 +31,7 @@ def leave_future_out(
     min_observations: int,
     var_name: str | None = None,
     refit: Refit | None = None,
+    progressbar: bool = True,
 ) -> ELPDDataLFO:
     r"""Score each observation by its predictive density given the observations before it.
 
@@ -74,6 +75,8 @@ def leave_future_out(
     refit : callable, optional
         Returns posterior draws of a copy of the model whose later observations are missing, such as
         ``lambda model: psf.sample_dram(1000, model=model, random_seed=1)``.
+    progressbar : bool
+        Whether to show how many terms are done, if they take more than two seconds.
 
     Returns
     -------
@@ -131,7 +134,8 @@ def leave_future_out(
     _check_min_observations(min_observations, 0 if refit is None else 1, observed.size, name)
     terms = _stored_terms(idata, name)
     if terms is None:
-        terms = sequential_terms(model, variable, select_draws(idata, None))
+        draws = select_draws(idata, None)
+        terms = sequential_terms(model, variable, draws, progressbar=progressbar)
     terms = terms.isel({time: observed})
     if refit is None:
         return _score_by_reweighting(idata, terms, min_observations)
@@ -140,7 +144,7 @@ def leave_future_out(
         warnings.filterwarnings("ignore", "LFO-CV triggered")
         return lfo_cv(
             xr.DataTree.from_dict({"log_likelihood": terms.to_dataset(name=name)}),
-            _Refits(model, variable, observed, refit),
+            _Refits(model, variable, observed, refit, progressbar),
             min_observations,
             forecast_horizon=1,
             time_dim=time,
@@ -275,9 +279,11 @@ class _Refits(SamplingWrapper):
         variable: StateSpaceVariable,
         observed: NDArray[np.int64],
         refit: Refit,
+        progressbar: bool,
     ) -> None:
         super().__init__(model)
         self._variable, self._observed, self._refit = variable, observed, refit
+        self._progressbar = progressbar
 
     def sel_observations(self, idx: NDArray[np.int64]) -> tuple[int, NDArray[np.int64]]:
         """The first row that is left out, and all rows that are."""
@@ -296,7 +302,8 @@ class _Refits(SamplingWrapper):
         self, excluded_obs: NDArray[np.int64], idata__i: xr.DataTree
     ) -> xr.DataArray:
         """Terms of later rows, with the noise of each draw."""
-        terms = sequential_terms(self.model, self._variable, select_draws(idata__i, None))
+        draws, bar = select_draws(idata__i, None), self._progressbar
+        terms = sequential_terms(self.model, self._variable, draws, progressbar=bar)
         return terms.isel({self._variable.dims[0]: excluded_obs})
 
 

@@ -10,10 +10,21 @@ import xarray as xr
 from ..filter_checks.checks import check_model, outcomes_of, store
 from ..filters.protocol import check_filter as check_is_filter
 from ..pymc_model.inspection import given_model
-from ..system.checks import check_count, check_random_seed
+from ..system.checks import check_count, check_flag, check_random_seed
+from ..tables import SentenceTable
 
 _LEAST_POINTS = 8
 _SECONDS = 20.0  # of CPU time, for all variables
+
+
+class FilterCheckTable(SentenceTable):
+    """The checks of the filters of a model; the sentences are the verdicts."""
+
+    main_columns = ("variable", "check", "statistic", "se", "visible", "outcome")
+
+    def _texts(self, name: str) -> list[str]:
+        is_number = name in ("statistic", "se", "visible")
+        return [f"{value:.2f}" if is_number else str(value) for value in self[name]]
 
 
 def check_filter(
@@ -23,7 +34,8 @@ def check_filter(
     filter: Any = None,
     n_draws: int = 20,
     random_seed: int | np.random.Generator | None = None,
-) -> pd.DataFrame:
+    progressbar: bool = True,
+) -> FilterCheckTable:
     """Compare a filter's log-likelihood with that of the system, at draws of the posterior.
 
     The likelihood of an EKF, UKF, IPLF, EnKF or PFEnKF is an approximation unless the system is
@@ -56,11 +68,14 @@ def check_filter(
     random_seed : None, int or numpy.random.Generator
         Seed of the points and of the noise. The numbers follow from it, unless time was up or an
         exact filter takes so long that time decides about it.
+    progressbar : bool
+        Whether to show the points that are done, if they take more than two seconds.
 
     Returns
     -------
     pandas.DataFrame
-        A row for each check of each observed StateSpace variable, with the columns
+        A row for each check of each observed StateSpace variable. Its display shows the numbers
+        and outcomes, and below them the verdicts. The columns are
 
         ``variable``, ``filter``
             the variable, and the filter that was checked
@@ -151,7 +166,13 @@ def check_filter(
         n_points=check_count("n_draws", n_draws, _LEAST_POINTS),
         seconds=_SECONDS,
         rng=check_random_seed(random_seed),
+        progressbar=check_flag("progressbar", progressbar),
     )
     if filter is None:
         store(idata, outcomes_of(table))
-    return table
+    return FilterCheckTable(table, sentences=_verdicts(table))
+
+
+def _verdicts(table: pd.DataFrame) -> list[str]:
+    pairs = zip(table["check"], table["verdict"], strict=True)
+    return [f"{check}: {verdict.rstrip('.')}." for check, verdict in pairs]

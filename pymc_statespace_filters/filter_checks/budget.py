@@ -1,6 +1,7 @@
 """How much a check may compute: the work that is planned, and the time after which it ends."""
 
 import time
+from collections.abc import Callable
 
 # Nanoseconds of a particle for a step, for each of its states and as much again, as measured.
 _PLAIN_NS, _GUIDED_NS = 5.0, 25.0
@@ -12,9 +13,13 @@ _SHARE, _SHARE_OF_OTHERS = 0.3, 0.5
 
 
 class Budget:
-    """CPU seconds of this process, counted from `begin`: compilation comes before."""
+    """CPU seconds of this process, counted from `begin`: compilation comes before.
+
+    ``on_progress`` is called with the number of new points.
+    """
 
     def __init__(self, seconds: float) -> None:
+        self.on_progress: Callable[[int], None] = lambda count: None
         self._seconds, self._began = seconds, time.process_time()
 
     def begin(self) -> None:

@@ -15,6 +15,7 @@ from ..errors import ModelError
 from ..filters.bootstrap import BootstrapPF
 from ..filters.protocol import Filter
 from ..filters.recommendation import check_system_and_filter, short_form
+from ..progress import row_progress
 from ..pymc_model.density import compile_raveled
 from ..pymc_model.filter_estimates import VariableAtPoints
 from ..pymc_model.inspection import element_names, log_density_terms, state_space_nodes
@@ -62,6 +63,7 @@ def check_model(
     n_points: int,
     seconds: float,
     rng: np.random.Generator,
+    progressbar: bool = False,
 ) -> pd.DataFrame:
     """Check the filters of all observed StateSpace variables, at draws of the posterior.
 
@@ -84,7 +86,9 @@ def check_model(
     for name, one in chosen.items():
         if name in checked:
             budget = Budget(seconds / len(checked))
-            with np.errstate(invalid="ignore"):  # minus infinity minus itself: failures
+            with row_progress(budget, enabled=progressbar) as begin, np.errstate(invalid="ignore"):
+                begin(f"check of {short_form(one)} of {name}", n_points)
+                # Invalid is minus infinity minus itself: failures.
                 findings = _check_variable(model, name, one, draws, n_points, budget, rng)
         else:
             findings = [_plain_row(one)]

@@ -119,6 +119,7 @@ def compare(
         for one, logs in zip(filters, found, strict=True):
             seeds = rng.integers(2**62, size=(len(points), _n_seeds(one)))
             logs.append(variable.at(points, one, seeds, scored=scored))
+        budget.on_progress(len(points))
         if budget.is_spent and points.stop >= _FEWEST:
             break
     estimates = [Estimates(f, np.concatenate(logs)) for f, logs in zip(filters, found, strict=True)]

@@ -2,11 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from html import escape
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+
+from ..tables import WIDTH, wrapped
 
 LEVEL, INCREASING, EDGE, HIDDEN, STEPPED = "level", "increasing", "edge", "hidden", "stepped"
 
@@ -142,17 +145,19 @@ class MaximumLikelihoodEstimate:
         error = f" ± {self.log_likelihood_se:.2g}" if self.log_likelihood_se > 0 else ""
         return f"Maximum likelihood: log-likelihood {self.log_likelihood:.4f}{error}"
 
-    def _shown(self) -> pd.DataFrame:
-        """The summary, without a column of reasons if there are none."""
-        return self.summary() if self.reasons else self.summary().drop(columns="reason")
+    def _sentences(self) -> list[str]:
+        """Why there are no standard errors, and the notes."""
+        reasons = [f"No standard error of {name}: {why}." for name, why in self.reasons.items()]
+        return [*reasons, *(f"Note: {note}." for note in self.notes)]
 
     def __repr__(self) -> str:
-        notes = [f"Note: {note}." for note in self.notes]
-        return "\n".join([self._headline(), self._shown().to_string(), *notes])
+        table = self.summary().drop(columns="reason").to_string(line_width=WIDTH)
+        return "\n".join([self._headline(), table, *wrapped(self._sentences())])
 
     def _repr_html_(self) -> str:
-        notes = "".join(f"<p>Note: {note}.</p>" for note in self.notes)
-        return f"<p>{self._headline()}</p>{self._shown().to_html()}{notes}"
+        sentences = "".join(f"<p>{escape(text)}</p>" for text in self._sentences())
+        table = self.summary().drop(columns="reason").to_html()
+        return f"<p>{self._headline()}</p>{table}{sentences}"
 
 
 def flattened(values: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -2,8 +2,10 @@
 
 import warnings
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from functools import partial
+from itertools import repeat
+from threading import Event
+from typing import Any, NamedTuple
 
 import numpy as np
 import pymc as pm
@@ -13,11 +15,12 @@ from numpy.typing import NDArray
 from ..errors import FilterWarning, ModelError
 from ..evaluation.simulate import simulator
 from ..parallel.cpu_affinity import available_cores
+from ..parallel.threads import run_in_threads
 from ..pymc_model.inspection import given_model
 from ..pymc_model.state_graphs import observed_variables
 from ..system.checks import check_flag, check_random_seed, shortened
+from ..system.given_record import inputs_with_times
 from ..system.model import StateSpaceModel
-from ..system.panel import inputs_with_times
 from ..system.placement import Placement, Timing, place_by
 from ..system.record import check_inputs, check_observed
 from ..system.timed_inputs import check_inputs_at
@@ -42,6 +45,7 @@ def free_run(
     n_draws: int | None = None,
     random_seed: int | np.random.Generator | None = None,
     extend_inferencedata: bool = True,
+    progressbar: bool = True,
 ) -> xr.DataTree:
     """Simulate from step 0 at draws of the posterior, without looking at observations.
 
@@ -50,7 +54,7 @@ def free_run(
 
     Parameters
     ----------
-    idata, model, var_name, n_draws, random_seed, extend_inferencedata
+    idata, model, var_name, n_draws, random_seed, extend_inferencedata, progressbar
         As in `filtered_states`.
     inputs : array_like, shape (rows, n_inputs), optional
         Row k holds during step k; by default those of the model. Of a panel also an array for
@@ -156,31 +160,22 @@ def free_run(
         name, (time, observable) = variable.name, variable.dims
         names: dict[str, Any] = {observable: list(variable.system.observables)}
         paths, seen, errors = [], [], []
-        for one, record, own in zip(
-            placed, at_draws.records, at_draws.generators(rng), strict=True
-        ):
-            (axis,), system = one.axes, one.system
-            rows = axis.steps
-            measured = _measured(record, observed, rows) if is_compared else None
-            if one.inputs[0] is None:
-                input_rows = record.inputs_until(axis)
-            else:
-                input_rows = check_inputs(one.inputs[0], system, axis)[None]
-            # A copy: the simulator would be compiled again for arrays of another layout.
-            input_rows = np.array(input_rows, order="C")
-            path, values = _simulate(
-                record, system, rows, input_rows, with_noise, draws.shape[0], own
-            )
-            paths.append(path)
-            seen.append(values)
-            if measured is not None:
-                noisy = (
-                    values
-                    if with_noise
-                    else simulate_observations(record, system, path, rows, input_rows, own)
-                )
-                predicted = draws.dataset({name: ((time, observable), values)}, names)[name]
-                errors.append(prediction_errors(predicted, noisy, measured))
+        with at_draws.progress("free runs", enabled=progressbar):
+            for one, record, own in zip(
+                placed, at_draws.records, at_draws.generators(rng), strict=True
+            ):
+                (axis,), system = one.axes, one.system
+                measured = _measured(record, observed, axis.steps) if is_compared else None
+                at = _At(system, axis.steps, _input_rows(record, one))
+                path, values = _simulate(at_draws, record, at, with_noise, own)
+                paths.append(path)
+                seen.append(values)
+                if measured is not None:
+                    noisy = values
+                    if not with_noise:
+                        noisy = simulate_observations(record, system, path, at.steps, at.rows, own)
+                    predicted = draws.dataset({name: ((time, observable), values)}, names)[name]
+                    errors.append(prediction_errors(predicted, noisy, measured))
         _warn_of_failed_runs(name, paths)
         state = dims[name]
         part = draws.dataset(
@@ -272,13 +267,33 @@ def _measured(record: RecordAtDraws, observed: Any, steps: NDArray[np.int64]) ->
     return check_observed(observed, record.variable.system, steps.size)
 
 
+class _At(NamedTuple):
+    """Where a record runs: the steps (R,) of its observations and its input rows, by draw or one.
+
+    ``system`` is the one that takes these steps.
+    """
+
+    system: StateSpaceModel
+    steps: NDArray[np.int64]
+    rows: Array
+
+
+def _input_rows(record: RecordAtDraws, placed: Placement) -> Array:
+    """The input rows (draws or 1, rows, columns) of a run: those given, else the model's."""
+    (axis,), (inputs,) = placed.axes, placed.inputs
+    if inputs is None:
+        rows = record.inputs_until(axis)
+    else:
+        rows = check_inputs(inputs, placed.system, axis)[None]
+    # A copy: the simulator would be compiled again for arrays of another layout.
+    return np.array(rows, order="C")
+
+
 def _simulate(
+    at_draws: VariableAtDraws,
     record: RecordAtDraws,
-    system: StateSpaceModel,
-    steps: NDArray[np.int64],
-    rows: Array,
+    at: _At,
     noise: bool,
-    n_chains: int,
     rng: np.random.Generator,
 ) -> tuple[Array, Array]:
     """States (draws, R, n) and observations (draws, R, p), each chain in a thread of its own.
@@ -286,21 +301,30 @@ def _simulate(
     NaN for a draw with a number that is not finite.
     """
     t0, theta = record.t0, record.theta
-    run = simulator(system, noise).function
-    paths = np.empty((len(theta), steps.size, system.n))
-    seen = np.empty((len(theta), steps.size, system.p))
+    run, n_chains = simulator(at.system, noise).function, at_draws.draws.shape[0]
+    paths = np.empty((len(theta), at.steps.size, at.system.n))
+    seen = np.empty((len(theta), at.steps.size, at.system.p))
+    stopped, n_done = Event(), np.zeros(n_chains, dtype=np.int64)
 
-    def simulate_chain(chain: NDArray[np.int64], seed: np.int64) -> None:
+    def simulate_chain(number: int, chain: NDArray[np.int64], seed: np.int64) -> None:
         own_rng = np.random.default_rng(seed)
         for i in chain:
-            inputs = rows[i if len(rows) > 1 else 0]
-            states, seen[i] = run(own_rng, theta[i], steps, inputs, t0)
-            paths[i] = states[steps]
+            if stopped.is_set():
+                return
+            inputs = at.rows[i if len(at.rows) > 1 else 0]
+            states, seen[i] = run(own_rng, theta[i], at.steps, inputs, t0)
+            paths[i] = states[at.steps]
+            n_done[number] += 1
 
     chains = np.split(np.arange(len(theta)), n_chains)
     seeds = rng.integers(np.iinfo(np.int64).max, size=n_chains)
-    with ThreadPoolExecutor(min(available_cores(), n_chains)) as pool:
-        list(pool.map(simulate_chain, chains, seeds))  # raises what a thread raised
+    run_in_threads(
+        list(map(partial, repeat(simulate_chain), range(n_chains), chains, seeds)),
+        min(available_cores(), n_chains),
+        n_done=lambda: int(n_done.sum()),
+        stop=stopped.set,
+        on_progress=at_draws.on_progress,
+    )
     failed = ~(np.isfinite(paths).all(axis=(1, 2)) & np.isfinite(seen).all(axis=(1, 2)))
     paths[failed] = seen[failed] = np.nan
     return paths, seen

@@ -201,18 +201,24 @@ class VariableAtDraws:
             return pytensor.function(all_inputs, bound, on_unused_input="ignore", trust_input=True)
 
     def _call(
-        self, function: Any, drawn: Sequence[np.ndarray], constant: Sequence[np.ndarray]
+        self,
+        function: Any,
+        drawn: Sequence[np.ndarray],
+        constant: Sequence[np.ndarray],
+        *,
+        is_counted: bool = True,
     ) -> list[Array]:
         columns = [np.arange(self.n_draws), *self._columns, *drawn]
         first = [column[0] for column in columns]
         rows = Rows(NativeFunction(function, [*first, *constant]), len(columns))
-        rows.on_progress = self.on_progress
+        if is_counted:
+            rows.on_progress = self.on_progress
         return rows(*columns)
 
     def _interpret(self, graph: Variable) -> Array:
         # Microseconds for each draw: machine code would take longer to compile than it saves.
         with pytensor.config.change_flags(mode="FAST_COMPILE"):
-            return self._call(self._compile([graph], []), [], [])[0]
+            return self._call(self._compile([graph], []), [], [], is_counted=False)[0]
 
     def _find_records(self) -> list[RecordAtDraws]:
         """The records, from the current data of the model."""

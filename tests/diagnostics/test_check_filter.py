@@ -79,6 +79,11 @@ def test_a_sensor_that_squares_is_compared_with_the_grid_filter():
     assert bias["statistic"] == pytest.approx((ekf - grid).mean(), rel=1e-6)
     assert bias["outcome"] == "off"
     assert "Use GridFilter()" in bias["verdict"]
+    lines = repr(table).splitlines()
+    assert max(map(len, lines)) <= 80
+    assert lines[0].split() == ["variable", "check", "statistic", "se", "visible", "outcome"]
+    assert lines[1].split()[:2] == ["0", "d"]
+    assert f"bias: {bias['verdict']}" in " ".join(line.strip() for line in lines)
     assert "off" in idata.attrs["filter_check"]
 
 

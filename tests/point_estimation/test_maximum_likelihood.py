@@ -189,7 +189,10 @@ def test_a_scale_of_zero_has_no_standard_error():
     assert list(found.reasons) == ["tau"]
     assert found.notes == ()  # the other searches ended at the same bound
     assert "at a bound of its support" in found.summary().loc["tau", "reason"]
-    assert "at a bound of its support" in repr(found)
+    text = repr(found)
+    assert "No standard error of tau:" in text
+    assert "at a bound of its support" in " ".join(text.split())
+    assert max(map(len, text.splitlines())) <= 80
 
 
 @pytest.mark.parametrize("settings", [{}, {"default_transform": None}])

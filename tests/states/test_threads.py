@@ -1,6 +1,7 @@
 """Many draws at once: in any number of threads, watched, stopped, and failing."""
 
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pymc as pm
@@ -15,6 +16,7 @@ from pymc_statespace_filters.compiler.native import rows as many_calls
 from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction
 from pymc_statespace_filters.compiler.native.rows import Rows
 from pymc_statespace_filters.pymc_model.state_graphs import observed_variables
+from pymc_statespace_filters.states import free_runs
 from pymc_statespace_filters.states.draws import select_draws
 from pymc_statespace_filters.states.variable import VariableAtDraws
 from tests.interrupts import interrupt_in
@@ -120,7 +122,6 @@ def at_draws_of(function, n_draws):
 
 def test_a_bar_that_appears_on_the_way_counts_all(screen, monkeypatch):
     monkeypatch.setattr(progress, "PATIENCE", 0.05)
-    monkeypatch.setattr(many_calls, "_REFRESH_SECONDS", 0.01)
 
     def slow(a):
         time.sleep(0.004)
@@ -128,9 +129,55 @@ def test_a_bar_that_appears_on_the_way_counts_all(screen, monkeypatch):
 
     with pytensor.config.change_flags(mode="FAST_COMPILE"):
         at_draws = at_draws_of(slow, 60)
-        with at_draws.progress("parameters", enabled=True):
-            assert at_draws.theta.shape[0] == 60
-    assert screen.bars == [["parameters", 60, 60]]
+        with at_draws.progress("states", enabled=True):
+            at_draws.records[0].states("filtered", STEPS, np.random.default_rng(1))
+    assert screen.bars == [["states", 60, 60]]
+
+
+def scores(idata, model, **bar):
+    psf.leave_future_out(idata, model, min_observations=2, **bar)
+
+
+def free_runs_of(idata, model, **bar):
+    psf.free_run(idata, model, random_seed=1, **bar)
+
+
+def checks(idata, model, **bar):
+    psf.check_filter(idata, model, filter=psf.EnKF(100), n_draws=8, random_seed=1, **bar)
+
+
+@pytest.mark.filterwarnings("ignore:1 of the 1 scores")
+@pytest.mark.parametrize(
+    ("work", "task", "total"),
+    [
+        (free_runs_of, "free runs", 60),
+        (scores, "terms of d", 60),
+        (checks, "check of EnKF(100) of d", 8),
+    ],
+)
+def test_bars_of_other_work(screen, work, task, total, monkeypatch):
+    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    given = posterior(a=np.random.default_rng(5).uniform(0.3, 0.5, (2, 30))), pair_model()
+    work(*given, progressbar=False)
+    assert screen.bars == []
+    work(*given)
+    assert screen.bars == [[task, total, total]]
+
+
+@pytest.mark.usefixtures("interrupts_arrive")
+def test_an_interrupt_stops_free_runs(monkeypatch):
+    calls = []
+
+    def slow(rng, theta, steps, inputs, t0):
+        calls.append(theta)
+        time.sleep(0.01)
+        return np.zeros((steps[-1] + 1, 2)), np.zeros((len(steps), 2))
+
+    monkeypatch.setattr(free_runs, "simulator", lambda *_: SimpleNamespace(function=slow))
+    interrupt_in(0.5)
+    with pytest.raises(KeyboardInterrupt):
+        psf.free_run(posterior(a=np.zeros((2, 5_000))), pair_model(), random_seed=1)
+    assert 0 < len(calls) < 2_000  # of 10 000, 50 s of them
 
 
 def test_an_exception_arrives():

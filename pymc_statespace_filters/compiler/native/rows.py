@@ -1,7 +1,7 @@
 """Functions at many rows of arguments: machine code in threads, or graphs that are interpreted."""
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from functools import partial
 
 import numpy as np
 import pytensor
@@ -13,10 +13,10 @@ from pytensor.tensor.variable import TensorVariable
 
 from ...parallel.cpu_affinity import available_cores
 from ...parallel.signals import held_interrupts
+from ...parallel.threads import run_in_threads
 from .entry_point import njit_cached
 from .pytensor_function import NativeFunction, make_call
 
-_REFRESH_SECONDS = 0.1
 # Control block of each thread: rows done, written by the thread; stop, written by the main thread.
 _N_DONE, _STOP = 0, 1
 
@@ -96,15 +96,16 @@ class Rows:
             self.on_progress(1)
             return results
         parts = [slice(*ends[i : i + 2]) for i in range(n_threads)]
-        with ThreadPoolExecutor(n_threads) as pool:
-            futures = [
-                pool.submit(self._call_part, rows[part], results[part], control[i])
+        run_in_threads(
+            [
+                partial(self._call_part, rows[part], results[part], control[i])
                 for i, part in enumerate(parts)
-            ]
-            try:
-                self._wait(futures, control)
-            finally:
-                control[:, _STOP] = True
+            ],
+            n_threads,
+            n_done=lambda: int(control[:, _N_DONE].sum()),
+            stop=lambda: control[:, _STOP].fill(True),
+            on_progress=self.on_progress,
+        )
         return results
 
     def _call_part(
@@ -119,16 +120,6 @@ class Rows:
         call, repeat = self._function.bind([*varying, *self._constant])
         if not _call_rows(call, argument, rows, results, control):
             repeat()
-
-    def _wait(self, futures: Sequence[Future], control: NDArray[np.int64]) -> None:
-        n_reported, pending = 0, set(futures)
-        while pending:
-            done, pending = wait(pending, _REFRESH_SECONDS, return_when=FIRST_EXCEPTION)
-            for future in done:
-                future.result()
-            n_done = int(control[:, _N_DONE].sum())
-            self.on_progress(n_done - n_reported)
-            n_reported = n_done
 
 
 def at_points(
