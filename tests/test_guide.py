@@ -123,6 +123,14 @@ def test_formulas_are_mathml_or_a_warning(displayed, monkeypatch):
     log.warning.assert_called_once()
 
 
+def test_pages_with_pictures_have_one_style():
+    pages = [*(ROOT / "docs").rglob("*.md"), *(ROOT / "docs").rglob("*.ipynb")]
+    texts = {page.name: page.read_text().replace("\\", "") for page in pages}
+    drawn = [n for n, text in texts.items() if "import pymc" in text and "plot_" in text]
+    assert len(drawn) > 10
+    assert [name for name in drawn if 'az.style.use("arviz-variat")' not in texts[name]] == []
+
+
 def test_pages_that_show_the_machine_are_named(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "docs")
     local_traces = import_module("local_traces")
