@@ -12,6 +12,8 @@ from pymc_statespace_filters.errors import ModelError
 from tests.diagnostics.records import PHI, PRIOR, SPREAD, SYSTEM
 from tests.systems import simulated
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 ROWS = np.array([1, 2, 4, 7])
 LABELS = ["A", "B", "C", "D", "E", "F"]
 RECORDS = np.array(
@@ -101,7 +103,8 @@ def test_each_record_is_diagnosed_as_if_alone(filter):
     assert found["d_uniformity"].dims == ("d_record", "observable")
     assert found["d_failed"].dims == ("d_record",)
     np.testing.assert_array_equal(found["d_panel"], np.repeat(LABELS, ROWS.size))
-    for g, record in enumerate(RECORDS):
+    for g in (0, 1, 5):  # the first, the one with a missing row, and the last
+        record = RECORDS[g]
         with pm.Model() as model:
             pm.Normal("phi", *PRIOR.args)
             psf.StateSpace(

@@ -48,7 +48,11 @@ def test_standard_error_in_four_dimensions_with_sticky_chains():
 # within [0.7, 1.4] with probability above 0.9995; seeds are fixed.
 @pytest.mark.parametrize(
     ("k", "n_draws", "correlation", "noise_sd"),
-    [(2, 150, 0.0, 0.0), (4, 600, 0.9, 0.0), (2, 600, 0.9, 1.2)],
+    [
+        (2, 150, 0.0, 0.0),
+        pytest.param(4, 600, 0.9, 0.0, marks=pytest.mark.slow),
+        (2, 600, 0.9, 1.2),
+    ],
 )
 def test_standard_errors_are_calibrated(k, n_draws, correlation, noise_sd):
     def make(rng):

@@ -71,7 +71,7 @@ def test_the_mean_likelihood_of_as_many_draws_of_the_prior():
 @pytest.mark.parametrize(
     ("make", "noise_sd", "target_se"),
     [
-        (ChibJeliazkov, 1.0, 0.025),
+        pytest.param(ChibJeliazkov, 1.0, 0.025, marks=pytest.mark.slow),
         (Importance, 1.0, 0.03),
         pytest.param(Bridge, 1.0, 0.0135, marks=pytest.mark.slow),
         pytest.param(WITH_TARGET["warp_bridge"], 1.0, 0.015, marks=pytest.mark.slow),

@@ -115,7 +115,11 @@ def test_a_mode_that_the_chains_have_missed():
 # For 200 scores with the tails of Student's law of 15 degrees the mean is within 0.25 of zero and
 # the mean square within [0.7, 1.4] with probability above 0.995; seeds are fixed.
 @pytest.mark.parametrize(
-    ("target", "noise_sd"), [(bounded(), 0.0), (half_normally_distributed(), 1.0)]
+    ("target", "noise_sd"),
+    [
+        pytest.param(bounded(), 0.0, marks=pytest.mark.slow),
+        (half_normally_distributed(), 1.0),
+    ],
 )
 def test_standard_errors_are_calibrated(target, noise_sd):
     z = scores(target, noise_sd, n_particles=50)

@@ -32,8 +32,6 @@ STATISTICS = {
     "mean_tree_accept": "acceptance_rate",
 }
 _SECONDS = 0.05
-# Draws of a run without a limit of its own, in those that are kept: they are in memory.
-MOST_THIN = 64
 
 
 class NutsChains(NamedTuple):
