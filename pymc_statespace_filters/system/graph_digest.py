@@ -159,7 +159,8 @@ def described(what: object, value: Any) -> str:
 def describe(value: Any) -> str:
     """A text that is equal for equal values, in every process."""
     if is_dataclass(value):
-        return _of(value, {field.name: getattr(value, field.name) for field in fields(value)})
+        compared = [field.name for field in fields(value) if field.compare]
+        return _of(value, {name: getattr(value, name) for name in compared})
     text = repr(value)
     if text.startswith("<") or " at 0x" in text:
         raise _UnstableError(text)

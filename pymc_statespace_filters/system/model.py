@@ -269,7 +269,7 @@ class StateSpaceModel:
         transition = self.equations.gaussian_transition
         if transition is None:
             return self
-        steps = {"transition": transition, "gaussian_transition": None}
+        steps = {"transition": transition, "gaussian_transition": None, "finite_step": None}
         # Of an infinite variance even the root is large: its square, in a sum of noises, overflows.
         return self._with_equations(steps)._with(discrete_noise=False, keeps_noises=True)
 
@@ -279,7 +279,7 @@ class StateSpaceModel:
         system = self.with_gaussian_steps
         if system.has_gaussian_start:
             return system
-        return system._with_equations({"initial_draw": None})
+        return system._with_equations({"initial_draw": None, "finite_start": None})
 
     def _with_equations(self, equations: Mapping[str, Any]) -> "StateSpaceModel":
         return self._with(equations=replace(self.equations, **equations))

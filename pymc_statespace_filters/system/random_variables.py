@@ -19,7 +19,7 @@ from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
-from .distributions import LAWS, Law, law_name, parameters_of
+from .distributions import FINITE_LAWS, LAWS, Law, law_name, parameters_of
 from .equations import Equation, as_symbol, static_shape
 from .graph_digest import is_made_after
 
@@ -34,6 +34,7 @@ class Drawn:
     mean and variance given the variables above it; it is linear in the normals to first order.
     ``is_gaussian`` tells whether the components are known to be jointly normal given the state.
     ``is_valid`` tells whether no draw of ``exact`` is NaN, as one of invalid parameters is.
+    ``given`` are the components given the values of the finite variables; None if there are none.
     """
 
     normals: TensorVariable
@@ -42,10 +43,27 @@ class Drawn:
     is_valid: TensorVariable
     is_discrete: bool
     is_gaussian: bool
+    given: "GivenValues | None" = None
 
     def where_valid(self, vector: TensorVariable) -> TensorVariable:
         """What is made of ``exact``, NaN where a draw is: a comparison with NaN is only false."""
         return vector if self.is_gaussian else pt.switch(self.is_valid, vector, np.nan)
+
+
+@dataclass(frozen=True)
+class GivenValues:
+    """Components given the values of all variables that take finitely many.
+
+    ``values`` (n_v,) has the numbers of these variables, those of parents first. The others are
+    normal ones as in ``surrogate``, and exact if ``others_are_gaussian``. ``law`` (4 n_v,) holds,
+    given the values before it, the probability of each value, whether its parameters are valid, and
+    its smallest and largest value.
+    """
+
+    values: TensorVariable
+    entries: TensorVariable
+    law: TensorVariable
+    others_are_gaussian: bool
 
 
 def trace_distributions(
@@ -72,8 +90,15 @@ def trace_distributions(
         node: normals[int(end) - size : int(end)]
         for node, size, end in zip(variables, sizes, np.cumsum(sizes, dtype=int), strict=True)
     }
-    exact, draws = _replaced(role, entries, nodes, places, lambda law: law.draw)
-    surrogate, _ = _replaced(role, entries, nodes, places, lambda law: law.surrogate)
+
+    def drawn(node: Apply, parameters: Sequence[TensorVariable]) -> TensorVariable:
+        return _law_of(role, node).draw(places[node], _shape(node), parameters)
+
+    def normal(node: Apply, parameters: Sequence[TensorVariable]) -> TensorVariable:
+        return _law_of(role, node).surrogate(places[node], _shape(node), parameters)
+
+    exact, draws = _replaced(role, entries, nodes, drawn)
+    surrogate, _ = _replaced(role, entries, nodes, normal)
     return Drawn(
         normals,
         exact,
@@ -81,6 +106,42 @@ def trace_distributions(
         ~pt.any(pt.concatenate([pt.isnan(draw).ravel() for draw in (normals, *draws)])),
         any(law.is_discrete for law in laws),
         all(law.is_gaussian for law in laws) and _are_separate(entries, variables),
+        _given_values(role, entries, nodes, normal),
+    )
+
+
+def _given_values(
+    role: str,
+    entries: Sequence[TensorVariable],
+    nodes: Sequence[Apply],
+    normal: Callable[[Apply, Sequence[TensorVariable]], TensorVariable],
+) -> GivenValues | None:
+    """The components given the values of the finite variables."""
+    variables = [node for node in nodes if _is_drawn(node)]
+    finite = [node for node in variables if type(node.op) in FINITE_LAWS]
+    if not finite:
+        return None
+    ends = np.cumsum([int(np.prod(_shape(node), dtype=int)) for node in finite]).tolist()
+    values = pt.tensor("v", shape=(ends[-1],), dtype="float64")
+    starts = dict(zip(finite, [0, *ends[:-1]], strict=True))
+    laws: list[Sequence[TensorVariable]] = []
+
+    def value(node: Apply, parameters: Sequence[TensorVariable]) -> TensorVariable:
+        if node not in starts:
+            return normal(node, parameters)
+        shape, law = _shape(node), FINITE_LAWS[type(node.op)]
+        size = int(np.prod(shape, dtype=int))
+        own = values[starts[node] : starts[node] + size].reshape(shape)
+        numbers = (law.probability(own, *parameters), law.is_valid(*parameters))
+        parts = (*numbers, *law.bounds(*parameters))
+        laws.append([pt.broadcast_to(pt.cast(p, "float64"), shape).ravel() for p in parts])
+        return own
+
+    given, _ = _replaced(role, entries, nodes, value)
+    law = pt.concatenate([part for parts in zip(*laws, strict=True) for part in parts])
+    others = [_law_of(role, node) for node in variables if node not in starts]
+    return GivenValues(
+        values, given, pt.specify_shape(law, (4 * ends[-1],)), all(o.is_gaussian for o in others)
     )
 
 
@@ -168,12 +229,11 @@ def _replaced(
     role: str,
     entries: Sequence[TensorVariable],
     nodes: Sequence[Apply],
-    places: Mapping[Apply, TensorVariable],
-    function_of: Callable[[Law], Callable],
+    replacement: Callable[[Apply, Sequence[TensorVariable]], TensorVariable],
 ) -> tuple[TensorVariable, list[Variable]]:
-    """The entries in one vector, with these variables replaced by functions of their normals.
+    """The entries in one vector, with random variables replaced; and these replacements.
 
-    And these functions.
+    A replacement is made of the variable and its parameters.
     """
     known: dict[Variable, Variable] = {}
     for node in nodes:
@@ -181,15 +241,14 @@ def _replaced(
         if isinstance(node.op, Elemwise) and node.outputs[0].type.dtype == "float32":
             # Of constants: PyMC's 1 / 3.0 would be a third to seven digits.
             inputs = [pt.cast(variable, "float64") for variable in inputs]
-        if node in places:
+        if _is_drawn(node):
             parameters = [pt.cast(value, "float64") for value in inputs[2:]]
-            drawn = function_of(_law_of(role, node))(places[node], _shape(node), parameters)
-            known[_output(node)] = pt.specify_shape(drawn, _shape(node))
+            known[_output(node)] = pt.specify_shape(replacement(node, parameters), _shape(node))
         elif inputs != node.inputs:
             known.update(zip(node.outputs, _rebuilt(role, node, inputs), strict=True))
     symbols = [as_symbol(role, known.get(entry, entry)) for entry in entries]
     parts = [symbol.dimshuffle("x") if symbol.type.ndim == 0 else symbol for symbol in symbols]
-    return pt.concatenate(parts), [known[_output(node)] for node in places]
+    return pt.concatenate(parts), [known[_output(node)] for node in nodes if _is_drawn(node)]
 
 
 def _rebuilt(role: str, node: Apply, inputs: Sequence[Variable]) -> list[Variable]:

@@ -14,7 +14,7 @@ from pytensor.tensor.variable import TensorVariable
 from ..errors import ModelError
 from .equations import Equation, as_vector, read_equation
 from .graph_digest import freeze
-from .random_variables import trace_distributions
+from .random_variables import GivenValues, trace_distributions
 
 Values = Mapping[str, TensorVariable]
 
@@ -27,12 +27,20 @@ class Start:
     cov: Any
     normals: TensorVariable | None = None
     draw: TensorVariable | None = None
+    given: GivenValues | None = None
 
     def freeze_draw(self, theta: TensorVariable) -> FrozenFunctionGraph | None:
         """The graph of a draw; None for a Gaussian start."""
         if self.draw is None or self.normals is None:
             return None
         return freeze([theta, self.normals], [self.draw], "initial_dist")
+
+    def freeze_given_values(self, theta: TensorVariable) -> FrozenFunctionGraph | None:
+        """The graph of the state given the values of finite variables, and of their law."""
+        if self.given is None or self.normals is None:
+            return None
+        both = pt.concatenate([self.given.entries, self.given.law])
+        return freeze([theta, self.normals, self.given.values], [both], "initial_dist")
 
 
 def check_start(mean: Any, cov: Any, dist: Any) -> None:
@@ -87,4 +95,4 @@ def trace_start(
         mean, cov = graph_replace([mean, jac @ jac.T], {drawn.normals: pt.zeros((m,))})
     if drawn.is_gaussian:
         return Start(mean, cov)
-    return Start(mean, cov, drawn.normals, drawn.where_valid(drawn.exact))
+    return Start(mean, cov, drawn.normals, drawn.where_valid(drawn.exact), drawn.given)

@@ -6,7 +6,7 @@ immutable graphs of what they return.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import pytensor.tensor as pt
@@ -103,6 +103,11 @@ class Equations:
     ``process_dist``, whose distributions are part of the transition. If these are not normal,
     ``gaussian_transition`` is the transition with normal variables of their means and variances.
     ``initial_draw``, of theta and normals, is that of a start that is not Gaussian.
+
+    ``finite_step`` has a further input ``v``, the values of the variables of ``process_dist`` that
+    take finitely many: the next state given them, then their law, see `GivenValues`.
+    ``finite_start``, of theta, normals and values, is the same of the start. Both follow from what
+    the user wrote, as the others do, and are not compared.
     """
 
     transition: FrozenFunctionGraph
@@ -115,6 +120,9 @@ class Equations:
     initial_mean: FrozenFunctionGraph
     initial_cov: FrozenFunctionGraph
     initial_draw: FrozenFunctionGraph | None
+    finite_step: FrozenFunctionGraph | None = field(default=None, compare=False)
+    finite_start: FrozenFunctionGraph | None = field(default=None, compare=False)
+    others_are_gaussian: bool = field(default=True, compare=False)
 
 
 def read(
@@ -218,8 +226,29 @@ def trace(
         initial_mean=freeze(inputs, [start.mean], "initial_mean"),
         initial_cov=freeze(inputs, [initial_cov], "initial_cov"),
         initial_draw=start.freeze_draw(theta),
+        finite_start=start.freeze_given_values(theta),
     )
-    return equations, seen
+    return _with_finite_step(equations, functions, symbols, inputs, begin), seen
+
+
+def _with_finite_step(
+    equations: Equations,
+    functions: Functions,
+    symbols: Symbols,
+    inputs: Sequence[TensorVariable],
+    begin: TensorVariable,
+) -> Equations:
+    """The equations with a step given the values of finite variables, if there are any."""
+    given = None if symbols.drawn is None else symbols.drawn.given
+    if given is None:
+        return equations
+    q = given.entries.copy(name="q")
+    step = as_vector("transition", functions.transition.step({**symbols.values, "q": q}), symbols.n)
+    both = graph_replace(
+        pt.concatenate([step, given.law]), {symbols.values["x"]: begin}, strict=False
+    )
+    graph = freeze([*inputs, given.values], [both], "process_dist")
+    return replace(equations, finite_step=graph, others_are_gaussian=given.others_are_gaussian)
 
 
 def _steps(functions: Functions, symbols: Symbols) -> tuple[TensorVariable, TensorVariable]:

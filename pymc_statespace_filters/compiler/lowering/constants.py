@@ -34,7 +34,7 @@ from .symbols import call, uses
 # Functions that are called at every step; the others, once per evaluation.
 _AT_EVERY_STEP = (
     "transition", "gaussian_transition", "process_noise", "observation", "observation_noise",
-    "observation_logp",
+    "observation_logp", "finite_step",
 )  # fmt: skip
 
 
@@ -56,7 +56,7 @@ def lowered(model: StateSpaceModel) -> Lowered:
     traced = {
         name: _trace(graph, theta)
         for name, graph in vars(model.equations).items()
-        if graph is not None
+        if isinstance(graph, FrozenFunctionGraph)
     }
     constants = [
         constant

@@ -4,8 +4,11 @@ import pytensor.tensor.random.basic as ptr
 from pytensor.graph.basic import Apply
 from pytensor.tensor.variable import TensorVariable
 
+from .finite import FINITE_LAWS, FiniteLaw
 from .scalar import SCALAR_LAWS, ScalarLaw
 from .vector import CategoricalLaw, MultinomialLaw, MvNormalLaw
+
+__all__ = ["FINITE_LAWS", "LAWS", "SCALAR_LAWS", "FiniteLaw", "Law", "law_name", "parameters_of"]
 
 type Law = ScalarLaw | CategoricalLaw | MultinomialLaw | MvNormalLaw
 

@@ -10,6 +10,7 @@ from pytensor.tensor.linalg import cholesky
 from pytensor.tensor.variable import TensorVariable
 
 from ..quantiles import normal_probability
+from .finite import are_probabilities
 from .scalar import COUNT, PROBABILITY, REAL, SCALAR_LAWS, Domain, root
 
 
@@ -32,7 +33,7 @@ class CategoricalLaw:
         for k in range(p.type.shape[-1] - 1):
             below = below + p[..., k]
             category = category + pt.gt(uniform, below)
-        return pt.switch(_are_probabilities(p), category, np.nan)
+        return pt.switch(are_probabilities(p), category, np.nan)
 
     def surrogate(
         self, z: TensorVariable, shape: tuple[int, ...], parameters: Sequence[TensorVariable]
@@ -60,7 +61,7 @@ class MultinomialLaw:
     ) -> TensorVariable:
         """A draw from the normals ``z``."""
         drawn = self._sequence(SCALAR_LAWS[ptr.BinomialRV].draw, z, shape, parameters)
-        return pt.switch(_are_probabilities(parameters[1]), drawn, np.nan)
+        return pt.switch(are_probabilities(parameters[1]), drawn, np.nan)
 
     def surrogate(
         self, z: TensorVariable, shape: tuple[int, ...], parameters: Sequence[TensorVariable]
@@ -113,7 +114,3 @@ def conditional_shares(shares: Sequence[Any], left: Any = 0.0) -> list[TensorVar
         left = left + share
         found.append(pt.switch(pt.eq(left, 0), 0.0, share / pt.switch(pt.eq(left, 0), 1.0, left)))
     return found[::-1]
-
-
-def _are_probabilities(p: TensorVariable) -> TensorVariable:
-    return pt.all(p >= 0, axis=-1) & (abs(pt.sum(p, axis=-1) - 1.0) < 1e-6)
