@@ -279,6 +279,11 @@ def run_models(
     >>> {name: tree["posterior"]["mu"].shape for name, tree in trees.items()}
     {'narrow': (4, 200), 'wide': (4, 200)}
     """
+    if unknown := settings.keys() - {field.name for field in fields(RunArguments)}:
+        raise TypeError(
+            f"run_models() got an unexpected keyword argument {min(unknown)!r}: its settings are "
+            "those of sample_dram, without model"
+        )
     if not isinstance(models, Mapping) or not models:
         raise ModelError(
             f"models must be a non-empty mapping of names to pymc.Model, got {models!r}"
@@ -288,11 +293,6 @@ def run_models(
             raise ModelError(f"names of models must be non-empty strings, got {name!r}")
         if not isinstance(model, Model):
             raise ModelError(f"models[{name!r}] must be a pymc.Model, got {model!r}")
-    if unknown := settings.keys() - {field.name for field in fields(RunArguments)}:
-        raise TypeError(
-            f"run_models() has no argument {min(unknown)!r}: beside models, pilot, checkpoint and "
-            "comm it takes those of sample_dram, without model"
-        )
     given = RunArguments(**settings)
     requests = warm_started_models(given.request(), models, pilot)
     options = given.options(comm)

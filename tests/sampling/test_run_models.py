@@ -158,7 +158,9 @@ def test_its_arguments_are_those_of_sample_dram():
         "comm",
     }
     for name in ("drwas", "model"):
-        with pytest.raises(TypeError, match=rf"run_models\(\) has no argument '{name}'"):
+        with pytest.raises(
+            TypeError, match=rf"run_models\(\) got an unexpected keyword argument '{name}'"
+        ):
             psf.run_models({"a": normal_model()}, **{name: 1})
 
 
