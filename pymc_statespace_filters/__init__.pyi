@@ -43,6 +43,8 @@ from .sampling import (
     suggest_particles,
 )
 from .states import filtered_states, forecast, free_run, smoothed_states
+from .system.drift_processes import OrnsteinUhlenbeck, RandomWalk
+from .system.drifting import drifting
 from .system.integrators import (
     EulerMaruyama,
     ExactLinear,
@@ -70,7 +72,9 @@ __all__ = [
     "GuidedPF",
     "LocalLinearization",
     "Milstein",
+    "OrnsteinUhlenbeck",
     "PFEnKF",
+    "RandomWalk",
     "RandomWalkSettings",
     "Ranks",
     "RungeKutta4",
@@ -83,6 +87,7 @@ __all__ = [
     "compare_evidence",
     "compartments",
     "compute_log_likelihood",
+    "drifting",
     "errors",
     "estimate_evidence",
     "filter_diagnostics",

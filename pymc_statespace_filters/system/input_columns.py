@@ -5,14 +5,16 @@ are, in this order,
 
 * of a system at any times, whose steps are not those of a grid, the step's length and the time at
   which it begins;
+* for each number of steps for which some drifting parameters are held, a one where they move at the
+  end of the step, and a zero elsewhere;
 * of a system with accumulators a one where an observation begins the step, at which they are set to
   zero, and a zero elsewhere.
 
-So filters, simulations and forecasts treat lengths, times and accumulators as they treat inputs.
+So filters, simulations and forecasts treat lengths, times and the rest as they treat inputs.
 Here these columns are made, read and hidden from the user.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -20,6 +22,7 @@ import pytensor.tensor as pt
 from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
+from .steps import GRID_TOLERANCE
 from .time_axis import TimeAxis
 
 if TYPE_CHECKING:
@@ -29,23 +32,29 @@ if TYPE_CHECKING:
 class InputRow(NamedTuple):
     """A row of inputs as a symbol: whole, the user's part, and the length and time of the step.
 
-    The latter are None for a system on a grid.
+    The latter are None for a system on a grid. ``moves`` has an element for each number of steps
+    for which parameters are held.
     """
 
     whole: TensorVariable
     of_user: TensorVariable
     length: TensorVariable | None
     time: TensorVariable | None
+    moves: Mapping[int, TensorVariable]
 
 
-def input_row(n_inputs: int, *, at_any_times: bool, has_accumulators: bool) -> InputRow:
+def input_row(
+    n_inputs: int, *, at_any_times: bool, has_accumulators: bool, held_for: Sequence[int]
+) -> InputRow:
     """The symbol of a row."""
-    n_columns = n_inputs + 2 * at_any_times + has_accumulators
+    first_move = n_inputs + 2 * at_any_times
+    n_columns = first_move + len(held_for) + has_accumulators
     u = pt.tensor("u", shape=(n_columns,), dtype="float64")
     of_user = u[:n_inputs] if n_columns > n_inputs else u
+    moves = {every: u[first_move + i] for i, every in enumerate(held_for)}
     if not at_any_times:
-        return InputRow(u, of_user, None, None)
-    return InputRow(u, of_user, u[n_inputs], u[n_inputs + 1])
+        return InputRow(u, of_user, None, None, moves)
+    return InputRow(u, of_user, u[n_inputs], u[n_inputs + 1], moves)
 
 
 def reset(
@@ -63,9 +72,10 @@ def with_columns(system: "StateSpaceModel", inputs: np.ndarray, axis: TimeAxis) 
     columns = []
     if axis.lengths is not None and axis.starts is not None:
         columns += [axis.lengths, axis.starts]
+    n_rows = inputs.shape[-2] if system.n_inputs else n_input_rows(system, axis.steps)
+    n_rows = n_rows if axis.starts is None else axis.starts.size
+    columns += [_moves(np.arange(n_rows), every, axis) for every in system.held_for]
     if system.accumulators:
-        n_rows = inputs.shape[-2] if system.n_inputs else n_input_rows(system, axis.steps)
-        n_rows = n_rows if axis.starts is None else axis.starts.size
         at_observation = np.zeros(n_rows)
         at_observation[axis.steps[axis.steps < n_rows]] = 1.0
         columns.append(at_observation)
@@ -97,6 +107,7 @@ def with_symbolic_columns(
         n_rows = pt.as_tensor(inputs).shape[0]
     else:
         n_rows = pt.max(pt.concatenate([pt.as_tensor(steps), [0]]))
+    columns += [_moves(pt.arange(n_rows), every, axis) for every in system.held_for]
     if system.accumulators:
         steps = pt.as_tensor(steps)
         # Steps past the last row fall on one row more, which is cut off.
@@ -111,6 +122,18 @@ def with_symbolic_columns(
     if axis.starts is not None:  # its last row may be missing
         rows = pt.concatenate([rows, rows[-1:]])[:n_rows]
     return pt.concatenate([rows, own], axis=1)
+
+
+def _moves(number: Any, every: int, axis: TimeAxis) -> Any:
+    """A one for each step, of these numbers, at whose end a parameter held for ``every`` moves."""
+    if axis.starts is None or axis.lengths is None:
+        is_symbol = isinstance(number, Variable)
+        moves = pt.eq((number + 1) % every, 0) if is_symbol else (number + 1) % every == 0
+        return moves.astype("float64")
+    held = every * axis.dt
+    begin = (axis.starts - axis.t0) / held + GRID_TOLERANCE
+    end = begin + axis.lengths / held
+    return np.asarray(np.floor(end) > np.floor(begin), dtype=np.float64)
 
 
 def without_resets(system: "StateSpaceModel", rows: np.ndarray) -> np.ndarray:
@@ -143,6 +166,10 @@ def divided(system: "StateSpaceModel", rows: Any, factor: int) -> Any:
         i = system.n_inputs
         columns[i] = columns[i] / factor
         columns[i + 1] = columns[i + 1] + number * columns[i]
+    first_move = system.n_inputs + 2 * system.is_at_any_times
+    is_last = xp.eq(number, factor - 1) if xp is pt else number == factor - 1
+    for i in range(first_move, first_move + len(system.held_for)):
+        columns[i] = columns[i] * is_last
     if system.accumulators:  # a step, not each of its parts, begins with a reset
         columns[-1] = columns[-1] * xp.eq(number, 0) if xp is pt else columns[-1] * (number == 0)
     return xp.stack(columns, axis=-1) if columns else repeated

@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import Any
 
 from ..errors import ModelError
+from .drift import DriftingParameter, held_for
 from .graph_digest import describe, digest
 from .integrators.protocol import Integrator, bound_to_states
 from .labels import default_names
@@ -145,15 +146,21 @@ class StateSpaceModel:
         shapes: Mapping[str, Sequence[int]] | None,
         carried: Sequence[str],
         accumulators: Sequence[str],
+        drifting: Sequence[DriftingParameter] = (),
         at_any_times: bool = False,
     ) -> None:
         """Set all fields, from what the user wrote."""
         functions = read(**written)
-        signature = read_signature(functions.equations, shapes, inputs)
+        signature = read_signature(functions.equations, shapes, inputs).with_drift(drifting)
         symbols = size(
-            functions, signature, has_accumulators=bool(accumulators), at_any_times=at_any_times
+            functions,
+            signature,
+            drifting,
+            has_accumulators=bool(accumulators),
+            at_any_times=at_any_times,
         )
-        state_names = checked_names("states", states, default_names("x", symbols.n))
+        state_names = checked_names("states", states, default_names("x", symbols.n_written))
+        state_names += tuple(one.name for one in drifting)
         totals = names_of_states("accumulators", accumulators, state_names)
         equations, seen = trace(
             functions, symbols, observables, [state_names.index(name) for name in totals]
@@ -176,6 +183,7 @@ class StateSpaceModel:
             inputs=signature.inputs,
             carried=names_of_states("carried", carried, state_names),
             accumulators=totals,
+            drifting=tuple(drifting),
             additive_noise=seen.additive,
             discrete_noise=symbols.drawn is not None and symbols.drawn.is_discrete,
             gaussian_observation=seen.gaussian,
@@ -188,6 +196,7 @@ class StateSpaceModel:
         )
         names = {"states": states, "observables": observables, "inputs": inputs}
         others = {"shapes": shapes, "carried": carried, "accumulators": accumulators}
+        others["drifting"] = drifting
         # To trace it again, with another integrator or at any times: neither compared nor pickled.
         self._set(_written=written, _settings=names | others)
 
@@ -206,6 +215,7 @@ class StateSpaceModel:
     inputs: tuple[str, ...]
     carried: tuple[str, ...]
     accumulators: tuple[str, ...]
+    drifting: tuple[DriftingParameter, ...]
     additive_noise: bool
     discrete_noise: bool
     gaussian_observation: bool
@@ -327,10 +337,40 @@ class StateSpaceModel:
             return "the steps of a system that was unpickled have one length"
         return "the steps of a transition that is a function have one length"
 
-    def _traced_again(self, at_any_times: bool, **changes: Any) -> "StateSpaceModel":
+    def with_drifting(self, drifting: Sequence[DriftingParameter]) -> "StateSpaceModel":
+        """The same system in which these parameters are states, and no others."""
+        if "_written" not in self.__dict__:
+            raise ModelError(
+                "system must not have been unpickled, for its functions are needed: let parameters "
+                "drift before the system is pickled"
+            )
+        return self._traced_again(self.is_at_any_times, drifting=tuple(drifting))
+
+    def check_drifting(self, names: Sequence[str]) -> None:
+        """Raise unless all these parameters are of equations that hold at every step."""
+        if "_written" not in self.__dict__:
+            return
+        functions = read(**self.__dict__["_written"])
+        of_steps = {name for e in functions.equations_of_steps for name in e.parameters}
+        for name in names:
+            if name not in of_steps:
+                raise ModelError(
+                    f"{name} must be a parameter of a step or an observation to drift, got one of "
+                    "the start alone"
+                )
+
+    def _traced_again(
+        self,
+        at_any_times: bool,
+        drifting: tuple[DriftingParameter, ...] | None = None,
+        **changes: Any,
+    ) -> "StateSpaceModel":
         system = object.__new__(StateSpaceModel)
         own = self.__dict__
-        system._trace(own["_written"] | changes, **own["_settings"], at_any_times=at_any_times)
+        settings = own["_settings"]
+        if drifting is not None:
+            settings = settings | {"drifting": drifting}
+        system._trace(own["_written"] | changes, **settings, at_any_times=at_any_times)
         return system
 
     @property
@@ -341,7 +381,13 @@ class StateSpaceModel:
     @property
     def is_at_any_times(self) -> bool:
         """Whether length and time of a step are columns of inputs."""
-        return self.n_input_columns > self.n_inputs + bool(self.accumulators)
+        other = len(self.held_for) + bool(self.accumulators)
+        return self.n_input_columns > self.n_inputs + other
+
+    @property
+    def held_for(self) -> tuple[int, ...]:
+        """The numbers of steps, above one, for which drifting parameters are held."""
+        return held_for(self.drifting)
 
     @property
     def n_theta(self) -> int:

@@ -1,7 +1,7 @@
 """Names of a system: parameters with defaults and shapes, states, observables and inputs."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -9,6 +9,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
 from .checks import is_integer
+from .drift import DriftingParameter
 from .equations import Equation
 
 
@@ -20,6 +21,18 @@ class Signature:
     defaults: tuple[tuple[str, Any], ...]
     shapes: tuple[tuple[int, ...], ...]
     inputs: tuple[str, ...]
+
+    def with_drift(self, drifting: Sequence[DriftingParameter]) -> "Signature":
+        """The same with the parameters of drift behind the others."""
+        shapes = dict(zip(self.parameters, self.shapes, strict=True))
+        own = {
+            name: shapes[one.parameter] if one.law_index else ()
+            for one in drifting
+            for name in one.laws
+        }
+        return replace(
+            self, parameters=(*self.parameters, *own), shapes=(*self.shapes, *own.values())
+        )
 
 
 def read_signature(

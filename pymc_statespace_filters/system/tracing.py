@@ -9,13 +9,24 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 import pytensor.tensor as pt
 from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.graph.replace import graph_replace
+from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
 from .checks import check_positive
+from .drift import (
+    DriftingParameter,
+    MovingRow,
+    bordered,
+    held_for,
+    moved,
+    starts,
+    values_now,
+)
 from .equations import (
     Equation,
     as_matrix,
@@ -64,6 +75,13 @@ class Functions:
         found = [other for other in others if isinstance(other, Equation)]
         return [*self.transition.equations, *self.observation.equations, *found]
 
+    @property
+    def equations_of_steps(self) -> list[Equation]:
+        """The user's functions that hold at every step, and not at the start alone."""
+        others = [self.process_noise, self.process_dist]
+        found = [other for other in others if isinstance(other, Equation)]
+        return [*self.transition.equations, *self.observation.equations, *found]
+
     def at_length(self, length: TensorVariable) -> "Functions":
         """The same with steps of this length, a symbol."""
         return replace(self, transition=self.transition.at_length(length))  # type: ignore[union-attr]
@@ -73,26 +91,45 @@ class Functions:
 class Symbols:
     """The symbols that the functions are called with: all parameters in one vector, and by name.
 
-    ``input_row`` is a row of inputs with all columns; ``values["u"]`` are the user's. ``time`` is
-    that of a step on a grid; ``values["t"]`` is the one that the functions see.
+    ``state``, ``noise`` and ``input_row`` are whole: with ``drifting`` parameters and all columns.
+    ``values`` has the user's parts of them; its parameters are those of the step, and those of
+    ``start_values`` the ones at the start. ``time`` is that of a step on a grid; ``values["t"]`` is
+    the one that the functions see.
     """
 
     theta: TensorVariable
+    state: TensorVariable
+    noise: TensorVariable
+    start_values: Values
     values: Values
     input_row: InputRow
     time: TensorVariable
     drawn: Drawn | None
     start: Start
+    drifting: Sequence[DriftingParameter]
+
+    dt: float
+
+    @property
+    def moving_row(self) -> MovingRow:
+        """When parameters move."""
+        length = self.input_row.length
+        return MovingRow(self.dt if length is None else length, self.dt, self.input_row.moves)
+
+    @property
+    def n_written(self) -> int:
+        """Number of states of the user's functions."""
+        return self.values["x"].type.shape[0]
 
     @property
     def n(self) -> int:
         """Number of states."""
-        return self.values["x"].type.shape[0]
+        return self.state.type.shape[0]
 
     @property
     def m(self) -> int:
         """Number of process noises."""
-        return self.values["q"].type.shape[0]
+        return self.noise.type.shape[0]
 
 
 @dataclass(frozen=True)
@@ -155,6 +192,7 @@ def read(
 def size(
     functions: Functions,
     signature: Signature,
+    drifting: Sequence[DriftingParameter] = (),
     *,
     has_accumulators: bool = False,
     at_any_times: bool = False,
@@ -164,23 +202,33 @@ def size(
     theta = pt.tensor("theta", shape=(n_theta,), dtype="float64")
     values = parameter_symbols(theta, signature.parameters, signature.shapes)
     start = trace_start(functions.initial_mean, functions.initial_dist, values, theta)
-    n = start.mean.type.shape[0]
     row = input_row(
-        len(signature.inputs), at_any_times=at_any_times, has_accumulators=has_accumulators
+        len(signature.inputs),
+        at_any_times=at_any_times,
+        has_accumulators=has_accumulators,
+        held_for=held_for(drifting),
     )
     time = pt.tensor("t", shape=(), dtype="float64")
-    values |= {
-        "x": pt.tensor("x", shape=(n,), dtype="float64"),
-        "u": row.of_user,
-        "t": time if row.time is None else row.time,
-    }
+    state, x = _longer("x", start.mean.type.shape[0], len(drifting))
+    values |= {"x": x, "u": row.of_user, "t": time if row.time is None else row.time}
+    now = values_now(drifting, values, state[x.type.shape[0] :])
     drawn = None
     if functions.process_dist is not None:
-        drawn = trace_distributions(functions.process_dist, values, theta, "q")
-        noise = drawn.normals
+        drawn = trace_distributions(functions.process_dist, now, theta, "q")
+        m = drawn.normals.type.shape[0]
     else:
-        noise = pt.tensor("q", shape=(_noise_size(functions, values),), dtype="float64")
-    return Symbols(theta, values | {"q": noise}, row, time, drawn, start)
+        m = _noise_size(functions, now)
+    noise, q = _longer("q", m, len(drifting))
+    return Symbols(
+        theta, state, noise, values, now | {"q": q}, row, time, drawn, start, drifting,
+        float(functions.transition.dt),
+    )  # fmt: skip
+
+
+def _longer(name: str, size: int, n_more: int) -> tuple[TensorVariable, TensorVariable]:
+    """A vector with ``n_more`` elements behind those of the user, and the user's part."""
+    whole = pt.tensor(name, shape=(size + n_more,), dtype="float64")
+    return whole, whole[:size] if n_more else whole
 
 
 def trace(
@@ -193,25 +241,22 @@ def trace(
 
     A step begins from the state in which the accumulators, given by their indices, are reset.
     """
-    values, n, m = symbols.values, symbols.n, symbols.m
-    if symbols.input_row.length is not None:
-        functions = functions.at_length(symbols.input_row.length)
+    values, theta, u = symbols.values, symbols.theta, symbols.input_row.whole
+    functions = _of_length(functions, symbols)
     n_observables = None if observables is None else len(observables)
     seen = functions.observation.trace(values, n_observables)
-    process_noise = _trace_process_noise(functions, values, m)
-    start, theta = symbols.start, symbols.theta
-    initial_cov = start.cov
-    if functions.initial_dist is None:
-        initial_cov = trace_covariance("initial_cov", functions.initial_cov, n, values)
-    x, q, u = values["x"], values["q"], symbols.input_row.whole
-    inputs = [theta, x, q, u, symbols.time, seen.noise, seen.datum]
+    process_noise = _trace_process_noise(functions, symbols)
+    for role, cov in (("observation_noise", seen.covariance), ("process_noise", process_noise)):
+        _check_free_of_state(role, cov, symbols)
+    start, initial_cov = _whole_start(functions, symbols)
+    inputs = [theta, symbols.state, symbols.noise, u, symbols.time, seen.noise, seen.datum]
 
     def frozen(role: str, output: TensorVariable | None) -> FrozenFunctionGraph | None:
         return None if output is None else freeze(inputs, [output], role)
 
-    begin = reset(x, u, accumulators)
+    begin = reset(symbols.state, u, accumulators)
     transition, gaussian_transition = (
-        freeze(inputs, graph_replace([step], {x: begin}, strict=False), "transition")
+        freeze(inputs, graph_replace([step], {symbols.state: begin}, strict=False), "transition")
         for step in _steps(functions, symbols)
     )
     density = "observation_logp" if seen.draw is None else "observation_dist"
@@ -251,9 +296,49 @@ def _with_finite_step(
     return replace(equations, finite_step=graph, others_are_gaussian=given.others_are_gaussian)
 
 
+def _of_length(functions: Functions, symbols: Symbols) -> Functions:
+    """The functions with steps of the length that they need.
+
+    The matrices of an exact step are computed once per evaluation; where one of its parameters
+    drifts they are those of the step, as where its length is a column of inputs.
+    """
+    length, transition = symbols.input_row.length, functions.transition
+    drifts = {one.parameter for one in symbols.drifting}
+    own = {name for equation in transition.equations for name in equation.parameters}
+    if length is None and hasattr(transition, "noise_cov") and drifts & own:
+        length = pt.as_tensor(np.float64(transition.dt))
+    return functions if length is None else functions.at_length(length)
+
+
+def _check_free_of_state(role: str, cov: TensorVariable | None, symbols: Symbols) -> None:
+    """Raise if a covariance depends on a drifting parameter."""
+    if cov is None or symbols.state not in ancestors([cov]):
+        return
+    names = [one.name for one in symbols.drifting]
+    of_noise, noise = ("transition", "q") if role == "process_noise" else ("observation", "e")
+    raise ModelError(
+        f"{role} must not depend on drifting parameters, {names}: give it the covariance of "
+        f"standard noise, and scale {noise} in {of_noise}, as in [... + sd * {noise}[0]]"
+    )
+
+
+def _whole_start(functions: Functions, symbols: Symbols) -> tuple[Start, TensorVariable]:
+    """The start, and its covariance, with drifting parameters at their values."""
+    start, values, drifting = symbols.start, symbols.start_values, symbols.drifting
+    cov = start.cov
+    if functions.initial_dist is None:
+        cov = trace_covariance("initial_cov", functions.initial_cov, symbols.n_written, values)
+    if not drifting:
+        return start, cov
+    numbers = starts(drifting, values)
+    mean = pt.concatenate([start.mean, numbers])
+    draw = None if start.draw is None else pt.concatenate([start.draw, numbers])
+    return replace(start, mean=mean, draw=draw), bordered(cov, len(drifting), 0.0)
+
+
 def _steps(functions: Functions, symbols: Symbols) -> tuple[TensorVariable, TensorVariable]:
     """The next state, and the same linear in normal variables."""
-    values, drawn = symbols.values, symbols.drawn
+    values, drawn, n = symbols.values, symbols.drawn, symbols.n_written
     if drawn is None:
         noises = [values["q"]]
     else:  # named for messages about an index that is out of range
@@ -261,8 +346,24 @@ def _steps(functions: Functions, symbols: Symbols) -> tuple[TensorVariable, Tens
     steps = [functions.transition.step({**values, "q": q}) for q in noises]
     linear = getattr(functions.transition, "linear_in_noise", None)
     surrogate = steps[-1] if linear is None else linear().step(values)
-    exact, gaussian = (as_vector("transition", step, symbols.n) for step in (steps[0], surrogate))
-    return exact if drawn is None else drawn.where_valid(exact), gaussian
+    exact, gaussian = (as_vector("transition", step, n) for step in (steps[0], surrogate))
+    if drawn is None:
+        return _with_moves(exact, symbols), _with_moves(gaussian, symbols)
+    both = [drawn.where_valid(exact), gaussian]
+    exact, gaussian = graph_replace(both, {drawn.normals: values["q"]}, strict=False)
+    return _with_moves(exact, symbols), _with_moves(gaussian, symbols)
+
+
+def _with_moves(step: TensorVariable, symbols: Symbols) -> TensorVariable:
+    """The next state with its drifting parameters."""
+    drifting = symbols.drifting
+    if not drifting:
+        return step
+    n, m = symbols.n_written, symbols.m - len(drifting)
+    numbers, noises = symbols.state[n:], symbols.noise[m:]
+    return pt.concatenate(
+        [step, moved(drifting, symbols.start_values, numbers, noises, symbols.moving_row)]
+    )
 
 
 @dataclass(frozen=True)
@@ -335,12 +436,17 @@ def _read_transition(
     return FunctionTransition(equation, check_positive("dt", 1.0 if dt is None else dt))
 
 
-def _trace_process_noise(functions: Functions, values: Values, m: int) -> TensorVariable | None:
-    """The covariance of q; None where q are standard normals."""
+def _trace_process_noise(functions: Functions, symbols: Symbols) -> TensorVariable | None:
+    """The covariance of the noise; None where it is standard normals."""
+    values, cov = symbols.values, None
+    m = values["q"].type.shape[0]
     if functions.process_noise is not None:
-        return trace_covariance("process_noise", functions.process_noise, m, values)
-    declared = getattr(functions.transition, "noise_cov", None)
-    return None if declared is None else as_matrix("noise_cov", declared(values), m, m)
+        cov = trace_covariance("process_noise", functions.process_noise, m, values)
+    elif (declared := getattr(functions.transition, "noise_cov", None)) is not None:
+        cov = as_matrix("noise_cov", declared(values), m, m)
+    if cov is None or not symbols.drifting:
+        return cov
+    return bordered(cov, len(symbols.drifting), 1.0)
 
 
 def _noise_size(functions: Functions, values: Values) -> int:
