@@ -22,6 +22,9 @@ GROUPS = {
         "RungeKutta4",
         "LocalLinearization",
         "ExactLinear",
+        "drifting",
+        "RandomWalk",
+        "OrnsteinUhlenbeck",
     ),
     "Parts of mechanical systems": (
         "mechanics.second_order",

@@ -50,6 +50,12 @@ class VectorField(NamedTuple):
 
 def vector_field(system: StateSpaceModel) -> VectorField:
     """The vector field of a system, from its drift if its integrator has one."""
+    if system.drifting:
+        names = [one.name for one in system.drifting]
+        raise ModelError(
+            f"system must have constant parameters, got the drifting {names}: give linear_modes "
+            "the system without drift"
+        )
     symbols = symbols_of(system)
     theta, x = symbols["theta"], symbols["x"]
     drift = _drift(system, theta, x)

@@ -18,6 +18,7 @@ from ..ops.states import FilterRun, ResumableRun
 from ..system.clock import Clock
 from ..system.given_record import GivenRecord
 from ..system.model import StateSpaceModel
+from ..system.own_units import in_own_units, law_in_own_units, moments_of_members
 from ..system.panel import CheckedPanel, checked_panel
 from ..system.parameters import flat_parameters, panel_parameters
 from ..system.placement import Earlier
@@ -209,6 +210,12 @@ def _dataset(
     weights: np.ndarray,
 ) -> xr.Dataset:
     """States along ``dim``, with members if the filter has any."""
+    if system.drifting:
+        members = in_own_units(system, members)
+        if weights.shape[1]:
+            mean, cov = moments_of_members(members, weights)
+        else:
+            mean, cov = law_in_own_units(system, mean, cov)
     variances = np.diagonal(cov, axis1=1, axis2=2)
     found: dict[str, tuple] = {
         "mean": ((dim, "state"), mean),

@@ -22,6 +22,7 @@ from ..progress import slow_compilation
 from ..system.checks import check_flag, check_random_seed
 from ..system.given_record import GivenRecord
 from ..system.model import StateSpaceModel
+from ..system.own_units import in_own_units
 from ..system.panel import checked_panel
 from ..system.parameters import flat_parameters, panel_parameters
 from ..system.record import check_system, checked_record
@@ -315,7 +316,7 @@ def simulate(
     n_steps = np.arange(states.shape[0])
     return xr.Dataset(
         {
-            "states": (("step", "state"), states),
+            "states": (("step", "state"), in_own_units(system, states)),
             "observations": (("obs", "observable"), observations),
         },
         coords={
@@ -357,7 +358,7 @@ def _simulate_panel(
     n_steps = [np.arange(len(path)) for path, _ in simulated]
     return xr.Dataset(
         {
-            "states": (("row", "state"), states),
+            "states": (("row", "state"), in_own_units(system, states)),
             "observations": (("obs", "observable"), observations),
         },
         coords={

@@ -47,3 +47,4 @@ class EKF(GaussianFilterBase):
         """Raise, unless the system is deterministic, if an update would not be a Kalman update."""
         self._check_gaussian(system)
         self._check_not_carried(system)
+        self._check_no_jumping_parameters(system)

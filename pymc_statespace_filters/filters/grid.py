@@ -112,9 +112,11 @@ class GridFilter:
     def check(self, system: System) -> None:
         """Raise if the system is not one that this filter can treat."""
         if system.n != 1:
+            moving = [one.name for one in system.model.drifting]
+            drift = f", of which {moving} are drifting parameters" if moving else ""
             raise ModelError(
                 f"GridFilter treats systems of one state, got {system.n} states "
-                f"{list(system.states)}"
+                f"{list(system.states)}{drift}"
             )
         if system.carried:
             raise ModelError(

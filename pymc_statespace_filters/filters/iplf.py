@@ -82,6 +82,7 @@ class IPLF(GaussianFilterBase):
     def check(self, system: System) -> None:
         """Raise if the moments of the observation are unknown or a state is carried."""
         self._check_not_carried(system)
+        self._check_no_jumping_parameters(system)
         check_sensor_has_noise(type(self).__name__, system)
         if system.gaussian_observation:
             return

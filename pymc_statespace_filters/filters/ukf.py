@@ -75,6 +75,7 @@ class UKF(GaussianFilterBase):
         """Raise if the observation is not Gaussian, a state is carried, or points coincide."""
         self._check_gaussian(system)
         self._check_not_carried(system)
+        self._check_no_jumping_parameters(system)
         check_kappa(self.kappa, system.n)
 
 

@@ -9,6 +9,7 @@ import xarray as xr
 from ..pymc_model.inspection import given_model
 from ..pymc_model.state_graphs import observed_variables, smoothing_method
 from ..system.checks import check_random_seed
+from ..system.own_units import in_own_units, moments_in_own_units
 from ..system.steps import check_at, rows_at
 from .draws import select_draws
 from .groups import add_group, coords_of_steps, join_rows, state_dims
@@ -189,11 +190,12 @@ def _add_states(
         _, mean, sd, drawn, n_effective, _ = zip(*states, strict=True)
         name, system = variable.name, variable.system
         time, state = variable.dims[0], dims[name]
+        means, sds = moments_in_own_units(system, join_rows(mean), join_rows(sd))
         part = draws.dataset(
             {
-                f"{name}_states": ((time, state), join_rows(drawn)),
-                f"{name}_mean": ((time, state), join_rows(mean)),
-                f"{name}_sd": ((time, state), join_rows(sd)),
+                f"{name}_states": ((time, state), in_own_units(system, join_rows(drawn))),
+                f"{name}_mean": ((time, state), means),
+                f"{name}_sd": ((time, state), sds),
                 f"{name}_n_effective": ((time,), join_rows(n_effective)),
             },
             {**coords_of_steps(at_draws, steps), state: list(system.states)},

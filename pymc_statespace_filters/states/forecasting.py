@@ -15,6 +15,7 @@ from ..pymc_model.state_graphs import observed_variables
 from ..system.checks import check_random_seed, is_integer
 from ..system.given_record import inputs_with_times
 from ..system.model import StateSpaceModel
+from ..system.own_units import in_own_units
 from ..system.placement import check_takes
 from ..system.steps import GRID_TOLERANCE, check_steps
 from ..system.time_axis import TimeAxis, TimesBetween, axis_of, check_increasing, is_grid
@@ -144,7 +145,10 @@ def forecast(
             draws.dataset(
                 {
                     name: ((time, observable), join_rows(simulated)),
-                    f"{name}_states": ((time, dims[name]), join_rows(paths)),
+                    f"{name}_states": (
+                        (time, dims[name]),
+                        in_own_units(system, join_rows(paths)),
+                    ),
                 },
                 {
                     **row_coords(

@@ -21,6 +21,7 @@ from ..pymc_model.state_graphs import observed_variables
 from ..system.checks import check_flag, check_random_seed, shortened
 from ..system.given_record import inputs_with_times
 from ..system.model import StateSpaceModel
+from ..system.own_units import in_own_units
 from ..system.placement import Placement, Timing, place_by
 from ..system.record import check_inputs, check_observed
 from ..system.timed_inputs import check_inputs_at
@@ -181,7 +182,10 @@ def free_run(
         part = draws.dataset(
             {
                 name: ((time, observable), join_rows(seen)),
-                f"{name}_states": ((time, state), join_rows(paths)),
+                f"{name}_states": (
+                    (time, state),
+                    in_own_units(variable.system, join_rows(paths)),
+                ),
             },
             {
                 **row_coords(at_draws, [one.axes[0].times(one.axes[0].steps) for one in placed]),

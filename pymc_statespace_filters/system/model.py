@@ -195,8 +195,12 @@ class StateSpaceModel:
             equations=equations,
         )
         names = {"states": states, "observables": observables, "inputs": inputs}
-        others = {"shapes": shapes, "carried": carried, "accumulators": accumulators}
-        others["drifting"] = drifting
+        others = {
+            "shapes": shapes,
+            "carried": carried,
+            "accumulators": accumulators,
+            "drifting": drifting,
+        }
         # To trace it again, with another integrator or at any times: neither compared nor pickled.
         self._set(_written=written, _settings=names | others)
 

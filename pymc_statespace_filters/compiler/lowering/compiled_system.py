@@ -15,7 +15,7 @@ from . import quantiles, structure
 from .constants import covariances, extend, followed_by_square_roots, lowered, pull_back
 from .guidance import guided_noise, linearize_step, n_gains, observation_information
 from .guide_loops import follow, look_back
-from .jumps import jumping_equations, stepped_parameters
+from .jumps import jumping_equations, jumping_parameters, stepped_parameters
 from .observation import expected_observation, observation_log_density
 from .symbols import call, symbols_of, uses
 
@@ -140,7 +140,10 @@ class CompiledSystem:
         z, mean = _normals(self.n_start), self._c[self.n_theta : self.n_theta + self.n]
         draw = self.model.equations.initial_draw
         if draw is None:
-            state = mean + self._square_roots["initial_cov"] @ z
+            # Drifting parameters, the last states, have a known start.
+            k = self.n - len(self.model.drifting)
+            root = self._square_roots["initial_cov"]
+            state = pt.concatenate([mean[:k] + root[:k, :k] @ z[:k], mean[k:]])
         else:
             (state,) = draw.bind([self._symbols["theta"], z])
         return self._member_function("initialise", "c, Z, X", state, "X", z=z)
@@ -290,6 +293,11 @@ class CompiledSystem:
         return jumping_equations(self.model)
 
     @cached_property
+    def jumping_parameters(self) -> tuple[str, ...]:
+        """Drifting parameters at whose threshold an equation is known to jump."""
+        return jumping_parameters(self.model)
+
+    @cached_property
     def stepped_parameters(self) -> tuple[str, ...]:
         """Parameters of which every likelihood is known to be a staircase."""
         return stepped_parameters(self.model)
@@ -313,7 +321,9 @@ class CompiledSystem:
 
     @cached_property
     def has_transition_density(self) -> bool:
-        """Whether one step has a Gaussian density given the state before."""
+        """Whether every step has a Gaussian density given the state before."""
+        if self.model.held_for:  # a parameter that is held has no noise
+            return False
         additive = self.has_additive_process_noise
         return additive and structure.process_noise_reaches_every_state(self.model)
 

@@ -71,9 +71,26 @@ def jumping_equations(system: StateSpaceModel) -> tuple[str, ...]:
     return tuple(found)
 
 
-def stepped_parameters(system: StateSpaceModel) -> tuple[str, ...]:
-    """Parameters of which every likelihood is a staircase; none where that is undecided."""
-    system = system.gaussian
+def jumping_parameters(system: StateSpaceModel) -> tuple[str, ...]:
+    """Drifting parameters at whose threshold an equation jumps; none where that is undecided.
+
+    Any gap counts: no linearisation sees that the parameter moves it.
+    """
+    if not system.drifting:
+        return ()
+    elements = _moments(system.gaussian)
+    stepped = {e for e in _under(elements) if isinstance(e.op, _STEPPED)}
+    first = system.n - len(system.drifting)
+    names = [f"x.{first + i}" for i in range(len(system.drifting))]
+    return tuple(
+        one.name
+        for one, name in zip(system.drifting, names, strict=True)
+        if _jumps_in(name, elements, stepped & depends_on(elements, frozenset({name})))
+    )
+
+
+def _moments(system: StateSpaceModel) -> Sequence[Value]:
+    """Mean and covariance of a step and an observation, in scalars; none where undecided."""
     symbols = symbols_of(system)
     moments = [*transition_moments(system, symbols)]
     if system.equations.observation is not None:
@@ -82,6 +99,12 @@ def stepped_parameters(system: StateSpaceModel) -> tuple[str, ...]:
         (elements,) = unrolled(Graph(symbols, [pt.concatenate([m.ravel() for m in moments])]))
     except NotUnrollableError:
         return ()
+    return elements
+
+
+def stepped_parameters(system: StateSpaceModel) -> tuple[str, ...]:
+    """Parameters of which every likelihood is a staircase; none where that is undecided."""
+    elements = _moments(system.gaussian)
     everything = _under(elements)
     inputs = {e.args[0] for e in everything if e.op is None}
     moving = frozenset(name for name in inputs if name.split(".")[0] in ("x", "q", "e"))

@@ -115,6 +115,15 @@ class GaussianFilterBase:
                 f"observation_dist or observation_logp"
             )
 
+    def _check_no_jumping_parameters(self, system: System) -> None:
+        """Raise if a drifting parameter is where an equation jumps, which no data would move."""
+        if names := system.jumping_parameters:
+            raise ModelError(
+                f"{type(self).__name__} cannot follow the drifting {', '.join(names)}, at which "
+                "an equation jumps: the observations would not move it. Let it be constant, or use "
+                "BootstrapPF"
+            )
+
     def _check_not_carried(self, system: System) -> None:
         """Raise if an update would move a carried state."""
         if system.carried and not system.is_deterministic:
