@@ -36,6 +36,7 @@ _N_LINES = 6
 _MOST_PLACES = 12  # on a line, those nearest to its middle
 _N_HALVINGS = 60
 _ROUNDING = 1e-6  # of a gap beside 1 and the value itself; rounding leaves far less
+_OVERFLOWING = 1e100  # where a series, as of a matrix exponential, has left its domain
 _JUMP = 0.3  # standard deviations of the noise: the least gap that counts
 
 type Evaluate = Callable[[float], tuple[np.ndarray, tuple]]
@@ -231,6 +232,6 @@ def _gap_between(evaluate: Evaluate, left: tuple, right: tuple, n: int) -> float
     below, above = left[1][:n], beyond[0][:n]
     gap = np.abs(above - below)
     is_gap = gap > _ROUNDING * (1.0 + np.minimum(np.abs(below), np.abs(above)))
-    counted = is_gap & np.isfinite(gap)
+    counted = is_gap & (gap < _OVERFLOWING)
     ratios = gap[counted] / np.sqrt(left[1][n:])[counted]
     return float(np.nanmax(ratios, initial=0.0))
