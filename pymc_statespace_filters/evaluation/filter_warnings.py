@@ -115,12 +115,26 @@ def _cures(
             "In process_dist a rate below 0, a probability above 1 or a size that is not a whole "
             "number is drawn as NaN"
         ]
+    if failure == Failure.STATE_NOT_FINITE and (outside := _outside(system, arguments[0])):
+        return [outside]
     cures = [failure.cure] if failure.cure else []
     if failure == Failure.ZERO_DENSITY and filter.noisy and not compiled.is_deterministic:
         exact = exact_filter(compiled, without=filter)
         if exact is None or np.isfinite(_terms(system, exact, arguments)).all():
             cures.append(elsewhere(compiled, filter).removesuffix("."))
     return cures
+
+
+def _outside(system: StateSpaceModel, theta: np.ndarray) -> str | None:
+    """Say that a drifting parameter starts where its scale has no number; None if none does."""
+    values = dict(zip(element_names(system), theta, strict=True))
+    for one in system.drifting:
+        if not one.link.contains(value := values[one.name]):
+            return (
+                f"The drifting {one.name} starts at {value:.4g}, outside its scale "
+                f"{one.process.scale!r}: give it a prior on this scale, or another scale"
+            )
+    return None
 
 
 def _terms(system: StateSpaceModel, filter: Any, arguments: Arguments) -> np.ndarray:

@@ -138,7 +138,7 @@ def _place(key: str, shapes: Mapping[str, tuple[int, ...]]) -> tuple[str, tuple[
 
 
 def _name(parameter: str, index: tuple[int, ...]) -> str:
-    return f"{parameter}[{','.join(map(str, index))}]" if index else parameter
+    return f"{parameter}[{', '.join(map(str, index))}]" if index else parameter
 
 
 def _check_names(system: "StateSpaceModel", found: list[DriftingParameter]) -> None:

@@ -75,6 +75,7 @@ def symbolic_parameters(
     """
     names = f"the model's variables are {sorted(others)}: name one so, or give the value in params"
     check_complete(system, values, names)
+    check_starts(system, values)
     parts = [
         _symbol(name, values[name], shape).ravel()
         for name, shape in zip(system.parameters, system.parameter_shapes, strict=True)
@@ -107,6 +108,19 @@ def check_complete(system: StateSpaceModel, found: Mapping[str, Any], others: st
             f"params must give every parameter without a default, {needed}{also}, got "
             f"no value for the parameters {missing}; {others or given}"
         )
+
+
+def check_starts(system: StateSpaceModel, values: Mapping[str, Any]) -> None:
+    """Raise if a number that is given for a drifting parameter lies outside its scale."""
+    for one in system.drifting:
+        if isinstance(values[one.parameter], Variable):
+            continue
+        start = numbers(one.parameter, values[one.parameter])
+        if not one.link.contains(start[(..., *one.index)]):
+            raise ModelError(
+                f"parameter {one.parameter!r} must start on the scale {one.process.scale!r} of its "
+                f"drift, got {start.tolist()!r}"
+            )
 
 
 def numbers(name: str, value: Any) -> np.ndarray:
@@ -147,6 +161,7 @@ def symbolic_panel_parameters(
     """Parameter values, numbers or symbols, as a symbolic matrix (G, k)."""
     names = f"the model's variables are {sorted(others)}: name one so, or give the value in params"
     check_complete(system, values, names)
+    check_starts(system, values)
     n_records = len(panel.records.labels)
     parts: list[Any] = [np.zeros((n_records, 0))] if not system.parameters else []
     for name, shape in zip(system.parameters, system.parameter_shapes, strict=True):

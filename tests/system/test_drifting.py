@@ -9,7 +9,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.errors import FilterWarning, ModelError
 from pymc_statespace_filters.pymc_model.step_refinement import path_eigenvalues
 from pymc_statespace_filters.system.input_columns import divided
 from pymc_statespace_filters.system.integrators.substeps import CoupledNoise
@@ -276,6 +276,35 @@ def test_laws_in_own_units_are_those_of_draws():
     (drawn_mean,), (drawn,) = moments_of_members(draws[None], weights)
     np.testing.assert_allclose(found_mean, drawn_mean, atol=0.01)  # four standard errors or more
     np.testing.assert_allclose(found, drawn, atol=0.015)
+
+
+def test_a_start_outside_the_scale_is_named():
+    system = psf.drifting(pushed(), gain=psf.RandomWalk(scale="log"))
+    params = {"a": 1.0, "gain": -0.3, "gain_strength": 0.1}
+    with pytest.warns(FilterWarning, match="gain starts at -0.3, outside its scale 'log'"):
+        psf.log_likelihood(system, psf.EKF(), params, DATA, steps=GRID, inputs=PUSH)
+    with pm.Model(), pytest.raises(ModelError, match=r"'gain' must start on.*'log'.*-0.3"):
+        psf.StateSpace(
+            "d", system, psf.EKF(), steps=GRID, observed=DATA, inputs=PUSH, params=params
+        )
+
+
+def test_a_model_of_pymc_has_the_columns_of_held_parameters():
+    system = psf.drifting(pushed(), gain=psf.OrnsteinUhlenbeck(scale="log", every=3))
+    params = PARAMS | {"gain_strength": 0.4, "gain_rate": 0.5}
+    expected = psf.log_likelihood(system, psf.EKF(), params, DATA, steps=GRID, inputs=PUSH)
+    for steps in (GRID, pm.Data):
+        with pm.Model() as model:
+            at = steps if steps is GRID else pm.Data("at", GRID)
+            pm.Normal("a")
+            psf.StateSpace(
+                "d", system, psf.EKF(), steps=at, observed=DATA, inputs=PUSH,
+                params={name: value for name, value in params.items() if name != "a"},
+            )  # fmt: skip
+            found = model.compile_logp(vars=[model["d"]], sum=True)({"a": params["a"]})
+        np.testing.assert_allclose(found, expected.sum(), rtol=1e-12)
+    gradient = model.compile_dlogp()({"a": params["a"]})
+    assert np.isfinite(gradient).all()
 
 
 def test_a_parameter_that_moves_a_jump_is_for_particles():
