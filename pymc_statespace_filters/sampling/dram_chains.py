@@ -218,7 +218,7 @@ def run_models(
 ) -> dict[str, DataTree] | None: ...
 
 
-@former_names(**FORMER_ARGUMENTS)  # type: ignore[misc]  # overloads name a few arguments
+@former_names(**FORMER_ARGUMENTS)
 def run_models(
     models: Mapping[str, Model],
     *,

@@ -116,7 +116,8 @@ def check_starts(system: StateSpaceModel, values: Mapping[str, Any]) -> None:
         if isinstance(values[one.parameter], Variable):
             continue
         start = numbers(one.parameter, values[one.parameter])
-        if not one.link.contains(start[(..., *one.index)]):
+        place: tuple[Any, ...] = (..., *one.index)
+        if not one.link.contains(start[place]):
             raise ModelError(
                 f"parameter {one.parameter!r} must start on the scale {one.process.scale!r} of its "
                 f"drift, got {start.tolist()!r}"

@@ -11,6 +11,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.errors import FilterWarning, ModelError
 from pymc_statespace_filters.pymc_model.step_refinement import path_eigenvalues
+from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.input_columns import divided
 from pymc_statespace_filters.system.integrators.substeps import CoupledNoise
 from pymc_statespace_filters.system.own_units import law_in_own_units, moments_of_members
@@ -91,7 +92,7 @@ def test_a_drifting_gain_of_a_linear_system_has_the_exact_likelihood(case, at):
         {"inputs": PUSH, "input_times": np.arange(20) * DT} if at != "grid" else {"inputs": PUSH}
     )
     found = psf.log_likelihood(system, psf.EKF(), PARAMS | params, DATA, **record)
-    checked = checked_record(system, DATA, **record)
+    checked = checked_record(system, GivenRecord(DATA, **record))
     starts, lengths = checked.axis.rows()
     rows = checked.arguments[2]
     expected = kalman(
@@ -196,7 +197,7 @@ def test_integrators_of_shorter_steps_keep_the_drift():
 
 def test_the_column_of_a_held_parameter_moves_once_in_a_divided_step():
     system = psf.drifting(pushed(), gain=psf.RandomWalk(every=2))
-    rows = checked_record(system, DATA, steps=GRID, inputs=PUSH).arguments[2]
+    rows = checked_record(system, GivenRecord(DATA, steps=GRID, inputs=PUSH)).arguments[2]
     np.testing.assert_array_equal(rows[:, 1], np.arange(20) % 2)
     finer = divided(system, rows, 3)
     np.testing.assert_array_equal(np.flatnonzero(finer[:, 1]), np.arange(5, 60, 6))
