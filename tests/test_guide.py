@@ -12,7 +12,9 @@ import pytest
 
 from tests.waiting import LIMIT
 
-pytest.importorskip("myst_nb")  # the newest releases are tested without those of the guide
+# The newest releases are tested without those of the guide.
+pytest.importorskip("myst_nb")
+pytest.importorskip("math_core")
 nodes = pytest.importorskip("docutils.nodes")
 
 ROOT = Path(__file__).parents[1]
