@@ -2,6 +2,7 @@
 
 import numpy as np
 import pymc as pm
+import pytensor
 import pytensor.tensor as pt
 import pytest
 
@@ -47,10 +48,16 @@ def single_model(label, filter=EKF, force=None):
     return model
 
 
+def alone(function, idata, model, **options):
+    """Results of a record alone. Its graphs run in Python: each would take seconds to compile."""
+    with pytensor.config.change_flags(mode="FAST_COMPILE"):
+        return function(idata, model, **options)
+
+
 def of_singles(function, group, *names, filter=EKF, **options):
     """Results of a model of each record, joined along the rows."""
     found = [
-        function(posterior(a=A[..., g]), single_model(label, filter), **options)[group]
+        alone(function, posterior(a=A[..., g]), single_model(label, filter), **options)[group]
         for g, label in enumerate(RECORDS.labels)
     ]
     return [np.concatenate([part[name].values for part in found], axis=2) for name in names]
@@ -86,8 +93,9 @@ def test_each_record_has_the_noise_of_its_own_estimate():
             single = posterior(a=A[..., g])
             stats = posterior(d_seed=np.reshape(noise, (2, 5)))
             single["sample_stats"] = stats["posterior"]
-            alone = psf.filtered_states(single, single_model(label, PARTICLES))
-            np.testing.assert_array_equal(found[:, :, rows], alone["filtered_states"]["d_mean"])
+            expected = alone(psf.filtered_states, single, single_model(label, PARTICLES))
+            expected = expected["filtered_states"]["d_mean"]
+            np.testing.assert_array_equal(found[:, :, rows], expected)
 
 
 def test_seeds_of_other_records_are_refused():
@@ -118,10 +126,9 @@ def test_records_may_share_their_inputs():
     force = LONG[0]
     found = psf.smoothed_states(posterior(a=A), panel_model(inputs=force))["smoothed_states"]
     for g, (label, rows) in enumerate(ROWS.items()):
-        alone = psf.smoothed_states(posterior(a=A[..., g]), single_model(label, force=force))
-        np.testing.assert_array_equal(
-            found["d_mean"][:, :, rows], alone["smoothed_states"]["d_mean"]
-        )
+        model = single_model(label, force=force)
+        expected = alone(psf.smoothed_states, posterior(a=A[..., g]), model)["smoothed_states"]
+        np.testing.assert_array_equal(found["d_mean"][:, :, rows], expected["d_mean"])
 
 
 def test_other_rows_set_after_sampling():
@@ -137,10 +144,10 @@ def test_other_rows_set_after_sampling():
         pm.set_data({"panel": [3, 4, 5], "steps": [2, 0, 1], "observed": DATA[3:] + 1.0})
     found = psf.filtered_states(posterior(mu=A[..., 0]), model)["filtered_states"]
     np.testing.assert_array_equal(found["d_panel"], [3, 4, 5])
-    alone = psf.run_filter(
+    expected = psf.run_filter(
         FORCED, psf.EKF(), {"a": A[0, 0, 0]}, DATA[3:4] + 1.0, steps=[2], inputs=LONG[0]
     )
-    np.testing.assert_allclose(found["d_mean"][0, 0, 0], alone["mean"][0], rtol=1e-12)
+    np.testing.assert_allclose(found["d_mean"][0, 0, 0], expected["mean"][0], rtol=1e-12)
 
 
 @pytest.mark.parametrize("own", [True, False])
@@ -227,11 +234,9 @@ def test_inputs_that_depend_on_free_variables():
     gains = A[..., 0]
     found = psf.smoothed_states(posterior(gain=gains), model)["smoothed_states"]["d_mean"]
     for label, rows in ROWS.items():
-        alone = psf.smoothed_states(
-            posterior(a=np.full((1, 1), 0.4)),
-            single_model(label, force=gains[1, 3] * FORCES[label]),
-        )
-        expected = alone["smoothed_states"]["d_mean"][0, 0]
+        model = single_model(label, force=gains[1, 3] * FORCES[label])
+        idata = alone(psf.smoothed_states, posterior(a=np.full((1, 1), 0.4)), model)
+        expected = idata["smoothed_states"]["d_mean"][0, 0]
         np.testing.assert_allclose(found[1, 3, rows], expected, rtol=1e-12)
 
 
