@@ -17,7 +17,17 @@ from .evidence import (
     reweight,
     step_error,
 )
-from .filters import EKF, IPLF, UKF, BootstrapPF, EnKF, GridFilter, GuidedPF, PFEnKF
+from .filters import (
+    EKF,
+    IPLF,
+    UKF,
+    BootstrapPF,
+    EnKF,
+    FiniteStateFilter,
+    GridFilter,
+    GuidedPF,
+    PFEnKF,
+)
 from .plots import (
     plot_average,
     plot_evidence,
@@ -68,6 +78,7 @@ __all__ = [
     "EnKF",
     "EulerMaruyama",
     "ExactLinear",
+    "FiniteStateFilter",
     "GridFilter",
     "GuidedPF",
     "LocalLinearization",

@@ -11,6 +11,7 @@ from .enkf import EnKF
 from .ensemble.base import EnsembleFilterBase
 from .ensemble.loop import Outcome, ensemble_filter, failed
 from .ensemble.particle_filter import ParticleFilter, particle_filter
+from .finite_state import FiniteStateFilter
 from .grid import GridFilter
 from .guided_pf import GuidedPF
 from .iplf import IPLF
@@ -41,6 +42,7 @@ __all__ = [
     "EnsembleFilter",
     "EnsembleFilterBase",
     "Filter",
+    "FiniteStateFilter",
     "GridFilter",
     "GuidedPF",
     "HealthFilter",

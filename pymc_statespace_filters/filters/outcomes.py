@@ -71,6 +71,13 @@ class Failure(OutcomeCode):
         "Write the observation so that it is defined at every state, for example with "
         "pt.softplus(x[0]), which is positive and does not overflow",
     )
+    INVALID_PROBABILITY = (
+        12,
+        "a probability of process_dist or initial_dist is outside of 0 to 1, or those of the "
+        "categories do not add up to one",
+        "Write probabilities so that they always are such, for example with pm.math.sigmoid, or "
+        "give them Beta and Dirichlet priors",
+    )
 
     @property
     def has_row(self) -> bool:
@@ -90,7 +97,7 @@ _WITHOUT_ROW = (
 (
     RAISED, NOT_A_NUMBER, NONE, STATE_NOT_FINITE, COVARIANCE_NOT_POSITIVE, ZERO_DENSITY,
     NO_PROCESS_NOISE, GRID_TOO_LARGE, OUT_OF_MEMORY, TOO_FAR, INITIAL_COV, PROCESS_NOISE,
-    OBSERVATION_NOISE, OBSERVATION_UNDEFINED,
+    OBSERVATION_NOISE, OBSERVATION_UNDEFINED, INVALID_PROBABILITY,
 ) = map(int, Failure)  # fmt: skip
 
 

@@ -97,7 +97,7 @@ class DifferentiableFilter(Filter, Protocol):
     holds the likelihood too shares the forward pass. The tape has a row before each prediction and
     before each update; without rows, the filter has failed. If a row is the mean of the state and
     the lower triangle of its covariance, `filter_diagnostics` reads the predictions from it; for a
-    deterministic system the mean is enough.
+    deterministic system the mean is enough. A filter with another tape is a `PredictionFilter`.
     """
 
     def compile_gradient(self, system: System) -> Compiled:

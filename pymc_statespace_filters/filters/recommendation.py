@@ -13,6 +13,7 @@ from ..system.record import check_system
 from .bootstrap import BootstrapPF
 from .ekf import EKF
 from .enkf import EnKF
+from .finite_state import FiniteStateFilter
 from .gaussian.base import GaussianFilterBase
 from .grid import GridFilter
 from .guided_pf import GuidedPF
@@ -23,7 +24,8 @@ from .ukf import UKF
 
 # In the order in which messages name them, with a first number of particles.
 FILTERS: tuple[Filter, ...] = (
-    EKF(), GridFilter(), IPLF(), UKF(), GuidedPF(100), BootstrapPF(1000), PFEnKF(1000), EnKF(1000)
+    EKF(), FiniteStateFilter(), GridFilter(), IPLF(), UKF(), GuidedPF(100), BootstrapPF(1000),
+    PFEnKF(1000), EnKF(1000),
 )  # fmt: skip
 
 # Particles that take as long as what does not depend on their number: a guide, or the calls of a

@@ -120,10 +120,11 @@ def gaussian_predictions(variable: StateSpaceVariable) -> Graphs | None:
     """Terms (J,), and mean (J, p) and covariance (J, p, p) of every observation before it is seen.
 
     They are read from the tape of the filter, as if the observation were linear over the spread of
-    the state; None if the filter has no tape. NaN if the filter failed.
+    the state; None if the filter has no tape of moments. NaN if the filter failed.
     """
     filter, n = variable.filter, variable.system.n
-    if not (isinstance(filter, DifferentiableFilter) and filter.has_gradient):
+    has_tape = isinstance(filter, DifferentiableFilter) and filter.has_gradient
+    if not has_tape or isinstance(filter, PredictionFilter):
         return None
     terms, _, tape = TapedLogLikelihood(variable.system, filter)(*_record(variable))
     rows = variable.steps + pt.arange(variable.steps.shape[0])

@@ -24,7 +24,7 @@ from .segment_pass import pass_on_segments
 from .segments import POINTS, points_of
 
 
-class _Laws(NamedTuple):
+class Laws(NamedTuple):
     """What is written; ``next`` (1,) is the number of the next observation."""
 
     next: np.ndarray
@@ -42,12 +42,12 @@ def _grid_predictions(plan, record, request, results):
     data = single_record(call, 0, 0, J)
     at, observed, t0, tolerance = data.steps, data.observed, data.t0, settings_of(call.plan)[0]
     system = read_system(call.plan, data.theta, data.inputs)
-    laws = _Laws(
+    laws = Laws(
         np.zeros(1, np.int64), reals_at(to[RESULTS.predicted], (J, p)),
         reals_at(to[RESULTS.predicted_cov], (J, p, p)), reals_at(to[RESULTS.log_below], (J, p)),
         reals_at(to[RESULTS.log_above], (J, p)),
     )  # fmt: skip
-    _forget(laws, 0)
+    forget(laws, 0)
     if system.failure != NONE:
         return status
     place, settings = ON_GRID, first_grid(system, at, t0, tolerance)
@@ -61,12 +61,12 @@ def _grid_predictions(plan, record, request, results):
             code, j = attempt(system, at, observed, t0, settings, tolerance, terms, _predict, tape)
         place, settings = next_attempt(place, code, settings)
     if code != NONE:
-        _forget(laws, j)
+        forget(laws, j)
     return status
 
 
 @njit_internal
-def _forget(laws, first):
+def forget(laws, first):
     """Leave the laws from a failing observation on unknown."""
     for j in range(first, laws.mean.shape[0]):
         for b in range(laws.mean.shape[1]):
@@ -106,9 +106,9 @@ def _write_law(tape, k, X, mass, n_together):
     if j == steps.size or steps[j] != k:
         return
     laws.next[0] = j + 1
-    h, roots = _observations(system, k, t0 + k * system.dt, X)
+    h, roots = observations_at(system, k, t0 + k * system.dt, X)
     weight = 1.0 / total_mass(mass)
-    _write_moments(mass, weight, h, roots, laws.mean[j], laws.cov[j])
+    write_mixture_moments(mass, weight, h, roots, laws.mean[j], laws.cov[j])
     for b in range(system.p):
         below, above = 0.0, 0.0
         for i in range(mass.size):
@@ -125,7 +125,7 @@ def _write_law(tape, k, X, mass, n_together):
 
 
 @njit_internal
-def _observations(system, k, t, X):
+def observations_at(system, k, t, X):
     """h (p, n) at every point, and what each standard normal adds to it (p, p, n)."""
     p, n = system.p, X.shape[1]
     h, roots, Z = np.empty((p, n)), np.empty((p, p, n)), np.zeros((p, n))
@@ -153,7 +153,7 @@ def _variance_of_cell(h, i, noise_variance):
 
 
 @njit_internal
-def _write_moments(mass, weight, h, roots, mean, cov):
+def write_mixture_moments(mass, weight, h, roots, mean, cov):
     """Mean and covariance of the mixture."""
     p = mean.size
     for b in range(p):

@@ -1,0 +1,209 @@
+"""The forward algorithm: exact for systems whose whole state takes finitely many values."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ..compiler.lowering.finite_states import Declared, FiniteStates, finite_states
+from ..compiler.native.entry_point import EntryPoint
+from ..compiler.native.plan import Plan
+from ..compiler.native.planned_function import PlannedFunction
+from ..errors import ModelError
+from ..system.checks import is_integer
+from .markov_chain.backward import BACKWARD
+from .markov_chain.forward import FORWARD
+from .markov_chain.functions import chain_functions
+from .markov_chain.predictions import PREDICTIONS_OF_CHAIN
+from .markov_chain.states import MOMENTS, RUN_OF_CHAIN, STATES_OF_CHAIN
+from .plan import make_plan
+from .protocol import System, check_sensor_has_noise
+from .signatures import GRADIENT, LIKELIHOOD_OF_NOISE, PREDICTIONS, PULLBACK, RUN, STATES, TAPED
+
+
+@dataclass(frozen=True)
+class FiniteStateFilter:
+    """Forward algorithm: the exact likelihood of a system whose states take finitely many values.
+
+    Hidden Markov models, Markov-switching regressions, counts of a small population: every state of
+    the system is a number at the start or drawn from ``pm.Bernoulli``, ``pm.Categorical``,
+    ``pm.DiscreteUniform`` or ``pm.Binomial``, and every step leads to such values, which the filter
+    finds. Probabilities of moves may depend on the state, on inputs, time and parameters, and
+    observations may have any density. The filter is deterministic and has a gradient.
+
+    Parameters
+    ----------
+    values : mapping of str to int or sequence of float, optional
+        Values of states by name, where the start does not lead to all of them; ``{"regime": 3}``
+        are 0, 1 and 2. A step that leads to other values is refused.
+
+    Raises
+    ------
+    ModelError
+        If ``values`` are no values; if the system has another state, or more than 4096 joint
+        values.
+
+    Notes
+    -----
+    Time grows with the number of moves, one for each joint value of the states and each value that
+    the noise may take there. Probabilities that depend on parameters alone are computed once for an
+    evaluation. A state whose probability is below 1e-308 of the likeliest one's is dropped.
+
+    L. R. Rabiner, "A tutorial on hidden Markov models", Proceedings of the IEEE 77 (1989). The
+    gradient is the reverse of the scaled recursion, so that moves of probability zero do no harm.
+
+    Examples
+    --------
+    >>> import pymc as pm
+    >>> import pytensor.tensor as pt
+    >>> import pymc_statespace_filters as psf
+    >>> hidden_markov = psf.StateSpaceModel(
+    ...     transition=lambda x, q: [q[0]],
+    ...     process_dist=lambda x, up, down: [
+    ...         pm.Bernoulli.dist(pt.switch(pt.eq(x[0], 0), up, 1 - down))
+    ...     ],
+    ...     observation=lambda x, level: [level * x[0]],
+    ...     observation_noise=[[0.25]],
+    ...     initial_dist=lambda up, down: [pm.Bernoulli.dist(up / (up + down))],
+    ...     states=["regime"],
+    ... )
+    >>> terms = psf.log_likelihood(
+    ...     hidden_markov,
+    ...     psf.FiniteStateFilter(),
+    ...     {"up": 0.3, "down": 0.2, "level": 1.0},
+    ...     [0.2, 1.1, 0.9, -0.3],
+    ...     steps=range(4),
+    ... )
+    >>> float(terms.sum().round(6))
+    -3.988134
+    """
+
+    values: Mapping[str, int | Sequence[float]] | None = None
+    declared: Declared = field(default=(), init=False, repr=False)
+
+    noisy: ClassVar[bool] = False
+    has_gradient: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        given = {} if self.values is None else self.values
+        if not isinstance(given, Mapping):
+            raise ModelError(f"values must be a mapping of states to values, got {given!r}")
+        found = tuple((name, _checked(name, given[name])) for name in sorted(given))
+        object.__setattr__(self, "declared", found)
+
+    def __hash__(self) -> int:
+        return hash(self.declared)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, FiniteStateFilter) and self.declared == other.declared
+
+    def check(self, system: System) -> None:
+        """Raise unless all states of the system are finite."""
+        equations = system.model.equations
+        if equations.finite_step is None and equations.finite_start is None:
+            raise ModelError(
+                "FiniteStateFilter needs states that are drawn from finitely many values, such as "
+                "pm.Bernoulli and pm.Categorical in process_dist or initial_dist, and none is"
+            )
+        found = self._finite_states(system)
+        if found.continuous:
+            (name, why), *_ = found.why_not.items()
+            raise ModelError(
+                "FiniteStateFilter treats systems whose states all take finitely many values, and "
+                f"the state {name!r} {why}"
+            )
+        if found.unbounded:
+            raise ModelError(
+                "FiniteStateFilter needs numbers of trials that are numbers or functions of the "
+                "state, at most 1000, and a pm.Binomial in process_dist has others"
+            )
+        check_sensor_has_noise(type(self).__name__, system)
+
+    def _finite_states(self, system: System) -> FiniteStates:
+        unknown = sorted({name for name, _ in self.declared} - set(system.states))
+        if unknown:
+            raise ModelError(
+                f"values must name states of {list(system.states)}, got {unknown[0]!r}"
+            )
+        return finite_states(system.model, self.declared)
+
+    def is_exact_for(self, system: System) -> bool:
+        """Whether the likelihood is that of the system."""
+        return system.has_exact_observation_density
+
+    def compile(self, system: System) -> PlannedFunction:
+        """Compile the log-likelihood."""
+        return PlannedFunction(self._plan(system, FORWARD), *LIKELIHOOD_OF_NOISE)
+
+    def compile_taped(self, system: System) -> PlannedFunction:
+        """Compile the forward pass, with a third result: the tape."""
+        return PlannedFunction(self._plan(system, FORWARD, leaves_tape=True), *TAPED)
+
+    def compile_pullback(self, system: System) -> PlannedFunction:
+        """Compile the backward pass along the tape."""
+        return PlannedFunction(self._plan(system, BACKWARD), *PULLBACK)
+
+    def compile_gradient(self, system: System) -> PlannedFunction:
+        """Compile both passes as one function."""
+        return PlannedFunction(self._plan(system, BACKWARD, leaves_tape=True), *GRADIENT)
+
+    def plan_of_many(
+        self, system: System, *, leaves_tape: bool = False, goes_back: bool = False
+    ) -> Plan:
+        """Plan a pass along many records, or of many points."""
+        return self._plan(system, BACKWARD if goes_back else FORWARD, leaves_tape=leaves_tape)
+
+    def compile_states(self, system: System, moment: str) -> PlannedFunction:
+        """Compile "predicted", "filtered" or "smoothed" states; smoothed draws are paths."""
+        plan = self._plan(system, STATES_OF_CHAIN, last_event=MOMENTS[moment])
+        return PlannedFunction(plan, *STATES)
+
+    def compile_run(self, system: System) -> PlannedFunction:
+        """Compile one run: its members are all states, and their weights the probabilities."""
+        n_states = len(self._finite_states(system).joint)
+        return PlannedFunction(self._plan(system, RUN_OF_CHAIN, n_members=n_states), *RUN)
+
+    def compile_predictions(self, system: System) -> PlannedFunction:
+        """Compile the law of every observation given those before it."""
+        plan = self._plan(system, PREDICTIONS_OF_CHAIN, functions=("observe",))
+        return PlannedFunction(plan, *PREDICTIONS)
+
+    def smoothing_method(self, system: System) -> str:
+        """Name the method of the smoothed states."""
+        return "forward-backward"
+
+    def _plan(
+        self,
+        system: System,
+        run: EntryPoint,
+        *,
+        functions: Sequence[str] = ("prepare",),
+        **others: int,
+    ) -> Plan:
+        chain, entries = chain_functions(system, self.declared), {}
+        if run is BACKWARD:
+            entries |= chain.derivatives
+            if system.extend_back is not None:
+                entries["extend_back"] = system.extend_back
+        n_states = int(chain.settings[0])
+        return make_plan(
+            system, run, functions, chain.settings, **chain.entries, **entries,
+            state_size=n_states, **others,
+        )  # fmt: skip
+
+
+def _checked(name: Any, values: Any) -> tuple[float, ...]:
+    """The values of a state, sorted."""
+    if is_integer(values) and values > 0:
+        return tuple(float(i) for i in range(values))
+    try:
+        found = np.unique(np.asarray(values, dtype="float64"))
+    except (TypeError, ValueError):
+        found = np.zeros(0)
+    if np.ndim(values) != 1 or not found.size or not np.isfinite(found).all():
+        raise ModelError(
+            f"values: those of {name!r} must be how many there are, or a sequence of finite "
+            f"numbers, got {values!r}"
+        )
+    return tuple(found.tolist())

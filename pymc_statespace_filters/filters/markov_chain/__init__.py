@@ -1,0 +1,1 @@
+"""The recursion of `FiniteStateFilter`, forward and back, compiled once for all systems."""

@@ -1,0 +1,60 @@
+"""The law of every observation given those before it: a mixture over the predicted states."""
+
+import math
+
+import numpy as np
+
+from ...compiler.native.jit import njit_internal
+from ...compiler.native.plan import RECORD, REQUEST, RESULTS, plan_entry
+from ..calls import OK, opened, reals_at, single_record
+from ..outcomes import NONE
+from ..plan import PLAN, read_system
+from ..point_mass.predictions import Laws, forget, observations_at, write_mixture_moments
+from .forward import forward_pass, rows_on_tape
+from .machine import read_chain
+from .states import predicted_at_observations
+
+
+@njit_internal
+def _write_law(system, chain, record, j, weights, laws):
+    """Write the law of an observation from the probabilities of the states before it."""
+    k = record.steps[j]
+    h, roots = observations_at(system, k, record.t0 + k * chain.dt, chain.X)
+    write_mixture_moments(weights, 1.0, h, roots, laws.mean[j], laws.cov[j])
+    for b in range(chain.p):
+        below, above = 0.0, 0.0
+        for i in range(weights.size):
+            variance = 0.0
+            for a in range(chain.p):
+                variance += roots[a, b, i] * roots[a, b, i]
+            z = (record.observed[j, b] - h[b, i]) / math.sqrt(2.0 * variance)
+            if weights[i] > 0.0:
+                below += 0.5 * weights[i] * math.erfc(-z)
+                above += 0.5 * weights[i] * math.erfc(z)
+        laws.log_below[j, b], laws.log_above[j, b] = math.log(below), math.log(above)
+
+
+def _predictions(plan, record, request, results):
+    status, call = opened(plan, record, request, results)
+    if status != OK or call.request[REQUEST.sizes_only]:
+        return status
+    to, p, J = call.results, call.plan[PLAN.p], call.record[RECORD.n_rows]
+    data = single_record(call, 0, 0, J)
+    laws = Laws(
+        np.zeros(1, np.int64), reals_at(to[RESULTS.predicted], (J, p)),
+        reals_at(to[RESULTS.predicted_cov], (J, p, p)), reals_at(to[RESULTS.log_below], (J, p)),
+        reals_at(to[RESULTS.log_above], (J, p)),
+    )  # fmt: skip
+    forget(laws, 0)
+    system = read_system(call.plan, data.theta, data.inputs)
+    chain = read_chain(call.plan, data.theta, data.inputs)
+    tape = np.empty((rows_on_tape(data.steps), chain.n_states))
+    code, end = forward_pass(chain, data, np.empty(J), tape)
+    known = J if code == NONE else int(end)
+    weights = predicted_at_observations(chain, data, tape, known)
+    for j in range(known):
+        _write_law(system, chain, data, j, weights[j], laws)
+    return status
+
+
+PREDICTIONS_OF_CHAIN = plan_entry(_predictions, "markov_chain_predictions")

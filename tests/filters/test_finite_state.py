@@ -1,0 +1,317 @@
+"""FiniteStateFilter against all paths written out, differences, and itself elsewhere."""
+
+import itertools
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+import pytest
+from scipy.stats import norm, poisson
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.filters.outcomes import Failure
+from pymc_statespace_filters.ops.base import evaluator
+from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.ops.states import Predictions, States
+from pymc_statespace_filters.system.parameters import flat_parameters
+from pymc_statespace_filters.system.record import checked_record
+
+# A regime that remembers the one before, is pushed by an input, and is seen by two sensors.
+SWITCH = psf.StateSpaceModel(
+    transition=lambda x, q: [q[0], x[0]],
+    process_dist=lambda x, u, up, down: [
+        pm.Bernoulli.dist(pm.math.sigmoid(pt.switch(pt.eq(x[0], 0), up, -down) + 0.5 * u[0]))
+    ],
+    observation=lambda x, level: [level * x[0] + 0.3 * x[1], x[0] - x[1]],
+    observation_noise=lambda s: [[s**2, 0.05], [0.05, 0.3]],
+    initial_dist=lambda first: [pm.Bernoulli.dist(first), 0],
+    states=["regime", "before"],
+    inputs=["push"],
+)
+GIVEN = {"up": -0.4, "down": 0.3, "level": 1.2, "s": 0.6, "first": 0.3}
+RECORD = {
+    "observed": np.array([[0.2, 0.1], [1.1, np.nan], [np.nan, np.nan], [1.4, -0.7], [-0.3, 0.2]]),
+    "steps": np.array([0, 1, 3, 4, 7]),
+    "inputs": np.array([0.3, -0.5, 1.0, 0.2, -0.1, 0.7, 0.4, 0.0]),
+}
+
+
+def switch_paths(up, down, level, s, first, observed, steps, inputs):
+    """All paths of the regime, and log p(path, data) of each."""
+    cov = np.array([[s**2, 0.05], [0.05, 0.3]])
+    paths = np.array(list(itertools.product(range(2), repeat=steps[-1] + 1)))
+    log_p = np.log(np.where(paths[:, 0] == 1, first, 1 - first))
+    for k in range(steps[-1]):
+        logit = np.where(paths[:, k] == 0, up, -down) + 0.5 * inputs[k]
+        log_p -= np.log1p(np.exp(np.where(paths[:, k + 1] == 1, -logit, logit)))
+    before = np.column_stack([np.zeros(len(paths)), paths[:, :-1]])
+    for k, d in zip(steps, observed, strict=True):
+        seen = ~np.isnan(d)
+        if seen.any():
+            mean = np.stack([level * paths[:, k] + 0.3 * before[:, k], paths[:, k] - before[:, k]])
+            error, part = (d[:, None] - mean)[seen], cov[np.ix_(seen, seen)]
+            quadratic = np.einsum("ai,ab,bi->i", error, np.linalg.inv(part), error)
+            log_p -= 0.5 * (quadratic + np.linalg.slogdet(2 * np.pi * part)[1])
+    return paths, log_p
+
+
+# A machine that wears out in three stages, and never recovers: moves of probability zero.
+WEAR = psf.StateSpaceModel(
+    transition=lambda x, q: [pt.minimum(x[0] + q[0], 2.0)],
+    process_dist=lambda x, p: [pm.Bernoulli.dist(pt.switch(x[0] < 2, p[0] * (1 + x[0]), 0.0))],
+    observation_dist=lambda x, rate: [pm.Poisson.dist(0.1 + rate * x[0])],
+    initial_mean=[0.0],
+    initial_cov=[[0.0]],
+    shapes={"p": (1,)},
+    states=["stage"],
+)
+WORN = {"p": [0.2], "rate": 1.5}
+COUNTS = {"observed": np.array([0.0, np.nan, 1.0, 2.0, 0.0, 5.0]), "steps": [0, 1, 2, 4, 5, 8]}
+
+
+def wear_log_likelihood(p, rate, observed, steps):
+    """By all paths."""
+    total = 0.0
+    for path in itertools.product(range(3), repeat=steps[-1] + 1):
+        probability = float(path[0] == 0)
+        for i, j in itertools.pairwise(path):
+            up = p[0] * (1 + i) if i < 2 else 0.0
+            probability *= {0: 1 - up, 1: up}.get(j - i, 0.0)
+        for k, d in zip(steps, observed, strict=True):
+            probability *= 1.0 if np.isnan(d) else poisson.pmf(d, 0.1 + rate * path[k])
+        total += probability
+    return np.log(total)
+
+
+def gradient(system, filter, params, record, weights=None):
+    """A weighted sum of terms and its derivative."""
+    arguments = (flat_parameters(system, params), *checked_record(system, **record).arguments, 0)
+    likelihood = LogLikelihood(system, filter)
+    terms, _ = evaluator(likelihood)(*arguments)
+    weights = 1.0 + 0.1 * np.arange(terms.size) if weights is None else weights
+    (slope,) = evaluator(likelihood.gradient())(*arguments, weights)
+    return terms @ weights, slope
+
+
+def by_differences(system, filter, params, record):
+    """The same derivative, by central differences of fourth order."""
+    theta, row = flat_parameters(system, params), checked_record(system, **record).arguments
+    run, found = evaluator(LogLikelihood(system, filter)), []
+    for i in range(theta.size):
+
+        def value(step, i=i):
+            terms, _ = run(theta + step * np.eye(theta.size)[i], *row, 0)
+            return terms @ (1.0 + 0.1 * np.arange(terms.size))
+
+        h = 1e-3
+        slopes = [(value(s) - value(-s)) / (2 * s) for s in (h, 2 * h)]
+        found.append((4 * slopes[0] - slopes[1]) / 3)
+    return np.array(found)
+
+
+def test_all_paths_of_a_regime_with_memory():
+    """A missing component, a missing row, steps between rows, and inputs."""
+    terms = psf.log_likelihood(SWITCH, psf.FiniteStateFilter(), GIVEN, **RECORD)
+    _, log_p = switch_paths(**GIVEN, **RECORD)
+    assert terms[2] == 0.0
+    np.testing.assert_allclose(terms.sum(), np.log(np.exp(log_p).sum()), rtol=1e-12)
+
+
+def test_all_paths_through_impossible_moves():
+    """And a count that is missing."""
+    terms = psf.log_likelihood(WEAR, psf.FiniteStateFilter(), WORN, **COUNTS)
+    np.testing.assert_allclose(terms.sum(), wear_log_likelihood(**WORN, **COUNTS), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("system", "given", "record"), [(SWITCH, GIVEN, RECORD), (WEAR, WORN, COUNTS)]
+)
+def test_gradient_is_that_of_differences(system, given, record):
+    """With moves of probability zero, missing rows and inputs."""
+    filter = psf.FiniteStateFilter()
+    _, found = gradient(system, filter, given, record)
+    expected = by_differences(system, filter, given, record)
+    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
+
+
+def test_gradient_where_a_probability_is_zero():
+    """One-sided: the derivative by a probability that is zero is that of the likelihood."""
+    h = 1e-6
+    record = COUNTS | {"observed": np.zeros(6)}
+    _, (_, found) = gradient(WEAR, psf.FiniteStateFilter(), {"p": [0.0], "rate": 1.5}, record)
+    value = [
+        gradient(WEAR, psf.FiniteStateFilter(), {"p": [p], "rate": 1.5}, record)[0]
+        for p in (0.0, h, 2 * h)
+    ]
+    np.testing.assert_allclose(found, (4 * value[1] - value[2] - 3 * value[0]) / (2 * h), rtol=1e-5)
+
+
+def test_two_thousand_observations():
+    """Terms and gradient stay finite and right."""
+    rng = np.random.default_rng(3)
+    record = {
+        "observed": rng.normal(size=(2000, 2)), "steps": np.arange(2000), "inputs": np.zeros(2000),
+    }  # fmt: skip
+    filter = psf.FiniteStateFilter()
+    _, found = gradient(SWITCH, filter, GIVEN, record)
+    np.testing.assert_allclose(found, by_differences(SWITCH, filter, GIVEN, record), rtol=1e-6)
+
+
+def states(moment, seeds, system=SWITCH, given=GIVEN, record=RECORD):
+    """Mean, sd and draws of the states at all steps."""
+    checked = checked_record(system, **record)
+    arguments = (flat_parameters(system, given), *checked.arguments, 0)
+    run = evaluator(States(system, psf.FiniteStateFilter(), moment))
+    wanted = np.arange(record["steps"][-1] + 1)
+    found = [run(*arguments, wanted, seed) for seed in seeds]
+    return found[0][0], found[0][1], np.array([f[2] for f in found])
+
+
+def test_smoothed_states_and_paths():
+    """Probabilities are those of all paths, and so are the frequencies of paths that are drawn.
+
+    The 4000 paths of 256 possible ones: chi-squared with the classes of fewer than 5 joined; fails
+    once in 1000 seeds.
+    """
+    paths, log_p = switch_paths(**GIVEN, **RECORD)
+    weights = np.exp(log_p - log_p.max())
+    weights /= weights.sum()
+    mean, sd, drawn = states("smoothed", range(4000))
+    np.testing.assert_allclose(mean[:, 0], weights @ paths, rtol=1e-12)
+    np.testing.assert_allclose(mean[1:, 1], mean[:-1, 0], rtol=1e-12)
+    np.testing.assert_allclose(sd, np.sqrt(mean * (1 - mean)), rtol=1e-9, atol=1e-9)
+    assert (drawn[:, 1:, 1] == drawn[:, :-1, 0]).all()
+    numbers = drawn[:, :, 0] @ 2 ** np.arange(7, -1, -1)
+    counts = np.bincount(numbers.astype(int), minlength=256)
+    large = 4000 * weights > 5
+    expected = np.append(4000 * weights[large], 4000 * weights[~large].sum())
+    found = np.append(counts[large], counts[~large].sum())
+    statistic = ((found - expected) ** 2 / expected).sum()
+    assert abs(statistic - large.sum()) < 3.3 * np.sqrt(2 * large.sum())
+
+
+def test_filtered_and_predicted_states():
+    """Those of all paths, given the data up to a step and before it."""
+    mean = {moment: states(moment, [0])[0] for moment in ("predicted", "filtered")}
+    for k in range(8):
+        for moment, last in (("predicted", k - 1), ("filtered", k)):
+            hidden = RECORD["observed"].copy()
+            hidden[RECORD["steps"] > last] = np.nan
+            paths, log_p = switch_paths(**GIVEN, **RECORD | {"observed": hidden})
+            weights = np.exp(log_p)
+            expected = weights @ paths[:, k] / weights.sum()
+            np.testing.assert_allclose(mean[moment][k, 0], expected, rtol=1e-12)
+
+
+def test_run_shows_the_probability_of_every_state():
+    """As particles, which are all joint values, and their weights."""
+    run = psf.run_filter(SWITCH, psf.FiniteStateFilter(), GIVEN, at="steps", **RECORD)
+    assert run["particles"].isel(time=3).values.tolist() == [[0, 0], [0, 1], [1, 0], [1, 1]]
+    np.testing.assert_allclose(run["weights"].sum("particle"), 1.0)
+    np.testing.assert_allclose(run["mean"].values, states("filtered", [0])[0], rtol=1e-12)
+
+
+def test_panel_and_many_points():
+    """Records and points have the terms and the gradient that they have alone."""
+    filter = psf.FiniteStateFilter()
+    points = {name: np.array([value, 0.9 * value]) for name, value in GIVEN.items()}
+    terms = psf.log_likelihood(SWITCH, filter, points, **RECORD)
+    other = {name: 0.9 * value for name, value in GIVEN.items()}
+    alone = psf.log_likelihood(SWITCH, filter, other, **RECORD)
+    np.testing.assert_allclose(terms[1], alone, rtol=1e-13)
+    with pm.Model() as model:
+        level = pm.Normal("level", shape=2)
+        psf.StateSpace(
+            "y", SWITCH, filter, params=GIVEN | {"level": level}, panel=["a"] * 5 + ["b"] * 5,
+            observed=np.concatenate([RECORD["observed"]] * 2), steps=[*RECORD["steps"]] * 2,
+            inputs=np.tile(RECORD["inputs"], (2, 1))[:, :, None],
+        )  # fmt: skip
+    point = {"level": np.array([1.2, 0.7])}
+    each = [
+        gradient(SWITCH, filter, GIVEN | {"level": v}, RECORD, weights=np.ones(5))
+        for v in point["level"]
+    ]
+    value = model.compile_logp(vars=model.observed_RVs)(point)
+    np.testing.assert_allclose(value, sum(alone for alone, _ in each), rtol=1e-12)
+    found = model.compile_dlogp(vars=[level])(point) + point["level"]  # without the prior
+    place = SWITCH.parameters.index("level")
+    np.testing.assert_allclose(found, [slope[place] for _, slope in each], rtol=1e-12)
+
+
+def test_failures_are_counted_with_their_row():
+    """A count below zero, and a probability above one."""
+    likelihood = evaluator(LogLikelihood(WEAR, psf.FiniteStateFilter()))
+    impossible = COUNTS["observed"].copy()
+    impossible[3] = -1.0
+    for p, observed, failure, row in (
+        (0.2, impossible, Failure.ZERO_DENSITY, 3),
+        (0.7, COUNTS["observed"], Failure.INVALID_PROBABILITY, 0),
+    ):
+        record = checked_record(WEAR, **COUNTS | {"observed": observed}).arguments
+        terms, health = likelihood(flat_parameters(WEAR, WORN | {"p": [p]}), *record, 0)
+        assert (Failure(int(health[1])), health[2]) == (failure, row)
+        assert np.isneginf(terms[row:]).all()
+        assert np.isfinite(terms[:row]).all()
+
+
+def test_densities_far_below_that_of_an_impossible_state():
+    """The terms are those of the possible states, 5000 nats below another one's."""
+    sure = {**GIVEN, "first": 0.0, "level": 100.0, "s": 1.0, "up": -900.0}
+    record = {"observed": [[100.0, 1.0]], "steps": [0], "inputs": [0.0]}
+    found = psf.log_likelihood(SWITCH, psf.FiniteStateFilter(), sure, **record)
+    cov = np.array([[1.0, 0.05], [0.05, 0.3]])
+    error = np.array([100.0, 1.0])
+    expected = -0.5 * (error @ np.linalg.solve(cov, error) + np.linalg.slogdet(2 * np.pi * cov)[1])
+    np.testing.assert_allclose(found, [expected], rtol=1e-12)
+
+
+def test_laws_of_observations():
+    """PIT values of `filter_diagnostics` are those of the mixture over the predicted states."""
+    arguments = (flat_parameters(SWITCH, GIVEN), *checked_record(SWITCH, **RECORD).arguments, 0)
+    mean, _, below, _ = evaluator(Predictions(SWITCH, psf.FiniteStateFilter()))(*arguments)
+    hidden = RECORD | {"observed": np.full((5, 2), np.nan)}
+    paths, log_p = switch_paths(**GIVEN, **hidden)
+    seen = GIVEN["level"] * paths[:, 0]
+    np.testing.assert_allclose(mean[0, 0], np.exp(log_p) @ seen, rtol=1e-12)
+    expected = np.exp(log_p) @ norm.cdf((0.2 - seen) / GIVEN["s"])
+    np.testing.assert_allclose(np.exp(below[0, 0]), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"transition": lambda x, q: [q[0], 0.5 * x[1] + x[0]]}, "'before' takes more than 1024"),
+        ({"initial_dist": lambda: [pm.Normal.dist(), 0]}, "'regime' starts from a distribution"),
+        ({"initial_dist": None, "process_dist": None, "transition": lambda x: x,
+          "initial_mean": [0, 0], "initial_cov": np.zeros((2, 2))}, "and none is"),
+    ],
+)  # fmt: skip
+def test_other_systems_are_refused(changes, message):
+    """By name of the state and with the reason."""
+    settings = {
+        "transition": lambda x, q: [q[0], x[0]],
+        "process_dist": lambda x: [pm.Bernoulli.dist(0.5)],
+        "observation": lambda x: [x[0]],
+        "observation_noise": [[1.0]],
+        "initial_dist": lambda: [0, 0],
+        "states": ["regime", "before"],
+    }
+    system = psf.StateSpaceModel(**settings | changes)
+    with pytest.raises(ModelError, match=message):
+        psf.log_likelihood(system, psf.FiniteStateFilter(), {}, [0.0])
+
+
+def test_values_are_checked():
+    """Numbers of values, sequences, names, and steps that leave them."""
+    with pytest.raises(ModelError, match="values: those of 'regime' must be how many"):
+        psf.FiniteStateFilter(values={"regime": 0})
+    with pytest.raises(ModelError, match=r"values must name states of .*got 'phase'"):
+        psf.log_likelihood(SWITCH, psf.FiniteStateFilter(values={"phase": 2}), GIVEN, **RECORD)
+    with pytest.raises(ModelError, match="'regime' must stay within"):
+        psf.log_likelihood(SWITCH, psf.FiniteStateFilter(values={"regime": 1}), GIVEN, **RECORD)
+    declared = psf.FiniteStateFilter(values={"regime": [1, 0]})
+    assert declared == psf.FiniteStateFilter(values={"regime": 2})
+    terms = psf.log_likelihood(SWITCH, declared, GIVEN, **RECORD)
+    plain = psf.log_likelihood(SWITCH, psf.FiniteStateFilter(), GIVEN, **RECORD)
+    np.testing.assert_array_equal(terms, plain)
