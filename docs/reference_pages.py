@@ -34,6 +34,7 @@ GROUPS = {
         "mechanics.hysteresis_branch",
         "mechanics.linear_modes",
     ),
+    "Parts of Markov chains": ("stationary",),
     "Parts of compartment models": (
         "compartments.euler_multinomial",
         "compartments.gamma_white_noise",
@@ -42,6 +43,7 @@ GROUPS = {
         "EKF",
         "UKF",
         "IPLF",
+        "FiniteStateFilter",
         "GridFilter",
         "GuidedPF",
         "BootstrapPF",

@@ -65,6 +65,7 @@ from .system.integrators import (
 )
 from .system.model import StateSpaceModel
 from .system.panel_frame import panel_from
+from .system.stationary import stationary
 from .system.steps import nearest_steps
 
 __version__: str
@@ -130,6 +131,7 @@ __all__ = [
     "sample_dram",
     "simulate",
     "smoothed_states",
+    "stationary",
     "step_error",
     "suggest_particles",
 ]

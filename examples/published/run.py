@@ -21,6 +21,7 @@ STUDIES = (
     "lynx_hare",
     "armadillo",
     "kangaroos",
+    "earthquakes",
 )
 TABLE = Path(__file__).parents[2] / "docs" / "_static" / "published.inc"
 

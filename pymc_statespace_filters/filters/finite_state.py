@@ -181,7 +181,8 @@ class FiniteStateFilter:
         functions: Sequence[str] = ("prepare",),
         **others: int,
     ) -> Plan:
-        chain, entries = chain_functions(system, self.declared), {}
+        chain = chain_functions(system, self.declared)
+        entries: dict[str, EntryPoint] = {}
         if run is BACKWARD:
             entries |= chain.derivatives
             if system.extend_back is not None:

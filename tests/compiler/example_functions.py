@@ -27,6 +27,16 @@ def _gradient(function):
     return lambda x: pytensor.grad(function(x), x)
 
 
+def _number(x):
+    """0, 1 or 2."""
+    return pt.cast(pt.floor(1.5 * abs(x[0])) % 3, "int64")
+
+
+def _chosen(x):
+    """An element whose place depends on the values, also from the end."""
+    return x[_number(x) - 2]
+
+
 MOVING = {
     "roll": lambda x: pt.roll(x, 1),
     "roll back": lambda x: pt.roll(x, -2) * x,
@@ -37,6 +47,9 @@ MOVING = {
     "increase": lambda x: pt.inc_subtensor(x[:2], x[1:]),
     "increase twice": lambda x: pt.inc_subtensor(x[[0, 0, 1]], x),
     "index list": lambda x: x[[2, 0]],
+    "index by a value": lambda x: A[0, 1] * _chosen(x) + pt.as_tensor(A)[:, _number(x)],
+    "row by a value": lambda x: pt.as_tensor(A)[_number(x) - 3, 1:] + x[_number(x)],
+    "derivative of a choice": _gradient(lambda x: x[_number(x)] ** 2 + (x * _chosen(x)).sum()),
     "stack": lambda x: pt.stack([x[0], x[2]]),
     "concatenate": lambda x: pt.concatenate([x, x**2]),
     "unpacked": _unpacked,

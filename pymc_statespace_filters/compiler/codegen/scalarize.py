@@ -5,7 +5,7 @@ runs the operations that only move elements (indexing, joining, reshaping) on th
 elementwise operations, sums and small linear algebra are written out.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial, reduce
 from typing import Any
 
@@ -207,11 +207,65 @@ def _as_array(element) -> np.ndarray:
 
 def _subtensor(arena: Arena, node, arguments: list[np.ndarray]) -> list:
     source, *indices = arguments
-    return [_as_array(source[_index(node, node.inputs[1:], indices)])]
+    chosen: np.ndarray | None = None
+    for holds, numbers in _choices(arena, source.shape, node.op, indices):
+        part = _as_array(source[_index(node, node.inputs[1:], numbers)])
+        if holds is True:
+            return [part]
+        # An index that is none of these is out of range.
+        rest = np.full(part.shape, np.nan, dtype=object) if chosen is None else chosen
+        chosen = _where(arena, holds, part, rest)
+    if chosen is None:
+        raise NotUnrollableError("an index into nothing")
+    return [chosen]
+
+
+def _choices(
+    arena: Arena, shape: Sequence[int], op, indices: list[np.ndarray]
+) -> Iterator[tuple[Value, list[np.ndarray]]]:
+    """Numbers that an index which depends on the state or a parameter may be, and when it is.
+
+    The condition is True where all indices are numbers. One may be a scalar that is not.
+    """
+    unknown = [i for i, a in enumerate(indices) if not all(map(is_constant, a.flat))]
+    if not unknown:
+        yield True, indices
+        return
+    place, *others = unknown
+    axes = [
+        axis for axis, entry in enumerate(op.idx_list) if isinstance(entry, int) and entry == place
+    ]
+    if others or not axes or indices[place].ndim:
+        raise NotUnrollableError("slices or several indices that depend on the state")
+    size = shape[axes[0]]
+    index = indices[place][()]
+    is_negative = arena.apply(ps.lt, index, 0)
+    index = arena.apply(ps.switch, is_negative, arena.apply(ps.add, index, size), index)
+    for k in range(size):
+        numbers = [*indices[:place], _as_array(k), *indices[place + 1 :]]
+        yield arena.apply(ps.eq, index, k), numbers
 
 
 def _inc_subtensor(arena: Arena, node, arguments: list[np.ndarray]) -> list:
     target, update, *indices = arguments
+    for holds, numbers in _choices(arena, target.shape, node.op, indices):
+        (changed,) = _changed(arena, node, target, update, numbers)
+        if holds is True:
+            return [changed]
+        target = _where(arena, holds, changed, target)
+    return [target]
+
+
+def _where(arena: Arena, holds: Value, yes: np.ndarray, no: np.ndarray) -> np.ndarray:
+    """A choice between the elements of two arrays of one shape."""
+    out = np.empty(yes.shape, dtype=object)
+    for index in np.ndindex(yes.shape):
+        out[index] = arena.apply(ps.switch, holds, yes[index], no[index])
+    return out
+
+
+def _changed(arena: Arena, node, target: np.ndarray, update: np.ndarray, indices: list) -> list:
+    """A target in which the elements at indices that are numbers are set or increased."""
     where = _index(node, node.inputs[2:], indices)
     positions = np.arange(target.size).reshape(target.shape)[where]
     updates = np.broadcast_to(update, np.shape(positions))

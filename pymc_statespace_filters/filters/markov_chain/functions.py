@@ -35,6 +35,7 @@ from ...compiler.lowering.finite_states import (
 from ...compiler.lowering.observation import observation_log_density
 from ...compiler.lowering.symbols import symbols_of
 from ...compiler.native.entry_point import EntryPoint
+from ...system.model import StateSpaceModel
 from ..protocol import System
 from .machine import sizes_and_tables
 
@@ -87,7 +88,7 @@ def _states(found: FiniteStates, n: int) -> np.ndarray:
     return table
 
 
-def _start(model: System) -> tuple[dict[str, TensorVariable], TensorVariable]:
+def _start(model: StateSpaceModel) -> tuple[dict[str, TensorVariable], TensorVariable]:
     """The probability of a start, of theta and its values z."""
     symbols, output = start_symbols(model)
     x = pt.tensor("x", shape=(model.n,), dtype="float64")
@@ -95,7 +96,7 @@ def _start(model: System) -> tuple[dict[str, TensorVariable], TensorVariable]:
     return {"theta": symbols["theta"], "x": x, "z": symbols["v"]}, probability
 
 
-def _move(model: System) -> tuple[dict[str, TensorVariable], TensorVariable]:
+def _move(model: StateSpaceModel) -> tuple[dict[str, TensorVariable], TensorVariable]:
     """The probability of a move, of theta, x, u, t and the values z."""
     symbols, output = step_symbols(model)
     probability = _product(output[model.n :], symbols["v"].type.shape[0])
@@ -110,7 +111,7 @@ def _product(law: TensorVariable, n_v: int) -> TensorVariable:
     return probability
 
 
-def _emission(model: System) -> tuple[dict[str, TensorVariable], TensorVariable]:
+def _emission(model: StateSpaceModel) -> tuple[dict[str, TensorVariable], TensorVariable]:
     """log p(d | x), of theta, x, u, t and the observation z."""
     symbols = symbols_of(model)
     density = observation_log_density(model, {i: symbols[i] for i in ("theta", *"xutd")})

@@ -111,7 +111,7 @@ def read_chain(plan, theta, inputs):
     at[0] = N_SIZES
     for i in range(len(lengths)):
         at[i + 1] = at[i] + lengths[i]
-    n_at_once = np.int64(1) if size[11] != 0 else max(np.int64(_AT_ONCE // D), np.int64(1))
+    n_at_once = 1 if size[11] != 0 else max(_AT_ONCE // D, 1)
     return Chain(
         failure=system.failure, n_states=K, p=plan[PLAN.p],
         dt=plan.view(np.float64)[PLAN.dt], is_invariant=size[10] != 0,

@@ -31,7 +31,7 @@ def _drawn(weights, u):
     total = 0.0
     for i in range(weights.size):
         total += weights[i]
-    threshold, last = u * total, np.int64(0)
+    threshold, last = u * total, 0
     for i in range(weights.size):
         if weights[i] > 0.0:
             last = i

@@ -1,0 +1,52 @@
+"""The stationary distribution of a Markov chain."""
+
+from typing import Any
+
+import numpy as np
+import pytensor.tensor as pt
+from pytensor.tensor.linalg import solve
+from pytensor.tensor.variable import TensorVariable
+
+from ..errors import ModelError
+from .equations import as_symbol, static_shape
+
+
+def stationary(probabilities: Any) -> TensorVariable:
+    """Return the distribution that the moves of a Markov chain do not change.
+
+    For a start in ``initial_dist``, ``pm.Categorical.dist(psf.stationary(P))``: a chain that has
+    run for long before the record begins.
+
+    Parameters
+    ----------
+    probabilities : array_like or TensorVariable, shape (K, K)
+        P[i, j] is the probability of a move from value i to value j in one step, so that rows add
+        up to one. With two or more groups of values that no move leaves there is no single result,
+        and this one is not finite or arbitrary.
+
+    Returns
+    -------
+    TensorVariable, shape (K,)
+        The solution of ``pi @ P == pi`` whose elements add up to one.
+
+    Raises
+    ------
+    ModelError
+        If this is no square matrix.
+
+    Examples
+    --------
+    >>> import pymc_statespace_filters as psf
+    >>> psf.stationary([[0.9, 0.1], [0.3, 0.7]]).eval().round(3)
+    array([0.75, 0.25])
+    """
+    matrix = as_symbol("probabilities", probabilities)
+    shape = static_shape(matrix)
+    if len(shape) != 2 or shape[0] != shape[1] or shape[0] is None:
+        raise ModelError(
+            f"probabilities must be a square matrix of static shape, got the shape {shape}"
+        )
+    size = shape[0]
+    # Of pi (I - P) = 0 and sum(pi) = 1: the second is added to every equation of the first.
+    equations = pt.eye(size) - matrix.T + np.ones((size, size))
+    return pt.specify_shape(solve(equations, np.ones(size), b_ndim=1), (size,))
