@@ -238,7 +238,7 @@ def _choices(
     if others or not axes or indices[place].ndim:
         raise NotUnrollableError("slices or several indices that depend on the state")
     size = shape[axes[0]]
-    index = indices[place][()]
+    index: Any = indices[place][()]
     is_negative = arena.apply(ps.lt, index, 0)
     index = arena.apply(ps.switch, is_negative, arena.apply(ps.add, index, size), index)
     for k in range(size):
@@ -260,7 +260,8 @@ def _where(arena: Arena, holds: Value, yes: np.ndarray, no: np.ndarray) -> np.nd
     """A choice between the elements of two arrays of one shape."""
     out = np.empty(yes.shape, dtype=object)
     for index in np.ndindex(yes.shape):
-        out[index] = arena.apply(ps.switch, holds, yes[index], no[index])
+        choices: list[Any] = [yes[index], no[index]]
+        out[index] = arena.apply(ps.switch, holds, *choices)
     return out
 
 

@@ -52,12 +52,17 @@ def log_normal(
 
 
 def observation_log_density(
-    system: StateSpaceModel, symbols: Mapping[str, TensorVariable]
+    system: StateSpaceModel, symbols: Mapping[str, TensorVariable], *, is_complete: bool = False
 ) -> TensorVariable:
-    """log p(d | x); Gaussian noise through D Gamma D^T at e = 0 (Eqs. 4.4, 4.12)."""
+    """log p(d | x); Gaussian noise through D Gamma D^T at e = 0 (Eqs. 4.4, 4.12).
+
+    Of an observation that ``is_complete`` no component is missing.
+    """
     if system.equations.observation_logp is not None:
         return call(system.equations.observation_logp, system, symbols)
     mean, cov = observation_moments(system, symbols)
+    if is_complete:
+        return log_normal(symbols["d"] - mean, cov, pt.ones(system.p))
     return log_normal(*without_missing(symbols["d"], mean, cov))
 
 

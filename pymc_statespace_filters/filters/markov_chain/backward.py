@@ -17,7 +17,7 @@ from ..calls import OK, end_of_record, opened, reals_at, single_record
 from ..outcomes import NONE, is_missing
 from ..plan import NULL, PLAN
 from .forward import all_records, load_block, new_block, rows_of_tapes
-from .machine import call_members, move_probabilities, read_chain
+from .machine import call_members, move_probabilities, read_chain, room_for_moves
 
 
 @njit_internal
@@ -58,14 +58,14 @@ def _back_to_start(chain, inputs, b, theta_bar):
 
 
 @njit_internal
-def predict_back(chain, P, f, b, new, P_bar):
+def _predict_back(chain, P, f, b, new, P_bar):
     """Write the cotangent of f, and add those of the moves."""
     for i in range(new.size):
         new[i] = 0.0
-    for m in range(chain.origin.size):
-        origin, number, later = chain.origin[m], chain.move_number[m], b[chain.successor[m]]
-        new[origin] += P[0, number] * later
-        P_bar[number] += f[origin] * later
+    for m in range(P.size):
+        origin, later = chain.origin[m], b[chain.successor[m]]
+        new[origin] += P[m] * later
+        P_bar[chain.move_number[m]] += f[origin] * later
 
 
 @njit_internal
@@ -73,15 +73,16 @@ def backward_pass(chain, record, tape, end, terms_bar, theta_bar):
     """Add the derivative of one record, whose rows on the tape end before ``end``; their first."""
     steps, K, D = record.steps, chain.n_states, chain.emission_X.shape[1]
     b, new = np.zeros(K), np.empty(K)
-    P, P_bar = np.empty((1, chain.move_X.shape[1])), np.zeros(chain.move_X.shape[1])
-    X, Z, _ = new_block(chain)
+    different, P = room_for_moves(chain)
+    P_bar = np.zeros(different.size)
+    n_at_once, X, Z, _ = new_block(chain, steps.size)
     weights = np.zeros(X.shape[1])
     derivatives = np.empty((max(chain.emission_rows.size, 1), weights.size))
     if chain.is_invariant:
-        move_probabilities(chain, record.inputs, 0, record.t0, P)
+        move_probabilities(chain, record.inputs, 0, record.t0, different, P)
     place = end - 1  # behind it is the last f
     for j in range(steps.size - 1, -1, -1):
-        at = j % chain.n_at_once
+        row = j % n_at_once
         if not is_missing(record.observed, j):
             place -= 2
             a, r, w = tape[place], tape[place + 1], 0.0
@@ -89,18 +90,18 @@ def backward_pass(chain, record, tape, end, terms_bar, theta_bar):
                 w += b[i] * a[i] * r[i]
             for i in range(K):
                 bar = r[i] * (terms_bar[j] + b[i] - w)
-                weights[at * D + chain.emission_number[i]] += a[i] * bar
+                weights[row * D + chain.emission_number[i]] += a[i] * bar
                 b[i] = bar
-        if at == 0 and chain.emission_rows.size:
-            k, t = load_block(chain, record, j, Z)
+        if row == 0 and chain.emission_rows.size:
+            k, t = load_block(chain, record, j, n_at_once, Z)
             call_members(chain.emission_back, chain.c, record.inputs, k, t, Z, X, derivatives)
             _add(chain.emission_rows, derivatives, weights, theta_bar)
             weights[:] = 0.0
         for k in range(steps[j] - 1, (steps[j - 1] if j else 0) - 1, -1):
             if not chain.is_invariant:
-                move_probabilities(chain, record.inputs, k, record.t0, P)
+                move_probabilities(chain, record.inputs, k, record.t0, different, P)
             place -= 1
-            predict_back(chain, P, tape[place], b, new, P_bar)
+            _predict_back(chain, P, tape[place], b, new, P_bar)
             b, new = new, b
             if not chain.is_invariant:
                 _back_to_moves(chain, record.inputs, k, record.t0, P_bar, theta_bar)

@@ -14,11 +14,17 @@ import numpy as np
 
 from ...compiler.native.jit import njit_internal
 from ...compiler.native.plan import HEALTH_SIZE, RECORD, RESULTS, plan_entry
-from ...compiler.numerics.exponential import exp
+from ...compiler.numerics.exponential import exp, log
 from ..calls import OK, end_of_record, include_health, opened, reals_at, single_record
 from ..outcomes import NONE, OBSERVATION_UNDEFINED, OUT_OF_MEMORY, ZERO_DENSITY, is_missing
 from ..plan import PLAN
-from .machine import call_members, move_probabilities, read_chain, start_probabilities
+from .machine import (
+    call_members,
+    move_probabilities,
+    read_chain,
+    room_for_moves,
+    start_probabilities,
+)
 
 # Below, the states that have a probability have densities much smaller than another state.
 _SMALL = 1e-250
@@ -26,42 +32,46 @@ _MOST = 700.0  # of an exponent
 
 
 @njit_internal
-def copy_row(tape, row, values):
+def _copy_row(tape, place, rows, row):
     """Write a row of a tape; nothing if there is none."""
     if tape.shape[0] > 0:
-        for i in range(values.size):
-            tape[row, i] = values[i]
+        for i in range(rows.shape[1]):
+            tape[place, i] = rows[row, i]
 
 
 @njit_internal
-def predict(chain, P, f, a):
-    """Write the probabilities one step later."""
-    for i in range(a.size):
-        a[i] = 0.0
-    for m in range(chain.origin.size):
-        a[chain.successor[m]] += P[0, chain.move_number[m]] * f[chain.origin[m]]
+def _predict(origin, first_move, P, f, now, later):
+    """Write the probabilities one step later to a row of f."""
+    for i in range(f.shape[1]):
+        total = 0.0
+        for m in range(first_move[i], first_move[i + 1]):
+            total += P[m] * f[now, origin[m]]
+        f[later, i] = total
 
 
 @njit_internal
-def new_block(chain):
-    """Arrays of observations that are evaluated at once: states, data, log-densities."""
+def new_block(chain, n_rows):
+    """How many observations are evaluated at once, and arrays: states, data, log-densities."""
     n, D = chain.emission_X.shape
-    size = chain.n_at_once * D
+    n_at_once = max(min(chain.n_at_once, n_rows), 1)
+    size = n_at_once * D
     X = np.empty((n, size))
     for i in range(n):
-        for number in range(size):
-            X[i, number] = chain.emission_X[i, number % D]
-    return X, np.zeros((chain.p, size)), np.empty((1, size))
+        for row in range(n_at_once):
+            for number in range(D):
+                X[i, row * D + number] = chain.emission_X[i, number]
+    return n_at_once, X, np.zeros((chain.p, size)), np.empty((1, size))
 
 
 @njit_internal
-def load_block(chain, record, first, Z):
+def load_block(chain, record, first, n_at_once, Z):
     """Load the observations from row ``first`` on; return step and time of the first."""
     D = chain.emission_X.shape[1]
-    for row in range(first, min(first + chain.n_at_once, record.steps.size)):
+    for row in range(first, min(first + n_at_once, record.steps.size)):
         for b in range(Z.shape[0]):
+            value = record.observed[row, b]
             for number in range((row - first) * D, (row - first + 1) * D):
-                Z[b, number] = record.observed[row, b]
+                Z[b, number] = value
     k = record.steps[first]
     return k, record.t0 + k * chain.dt
 
@@ -72,7 +82,8 @@ def _densities(log_p, D, shifts, E):
     for row in range(shifts.size):
         largest = -np.inf
         for number in range(row * D, (row + 1) * D):
-            largest = max(largest, log_p[0, number])  # NaN is not larger
+            value = log_p[0, number]
+            largest = value if value > largest else largest  # NaN is not
         shifts[row] = largest
         for number in range(row * D, (row + 1) * D):
             E[number] = log_p[0, number] - largest
@@ -81,45 +92,51 @@ def _densities(log_p, D, shifts, E):
 
 
 @njit_internal
-def _update(chain, E, shift, log_p, a, r, f):
-    """Write r and f, and return the term; NaN if the observation has no density."""
+def _update(number, E, log_p, first, shift, f, before, after, r):
+    """Write r and a row of f; return s and the logarithm of its unit. s is NaN without a density.
+
+    The densities of the observation are those from ``first`` on.
+    """
     s = 0.0
-    for i in range(a.size):
-        r[i] = E[chain.emission_number[i]]
-        s += a[i] * r[i]
-    if not (s > _SMALL and s < np.inf):
-        s, shift = _update_by_logs(chain, log_p, a, r)
-        if not (s > 0.0 and s < np.inf):
-            return np.nan
-    scale = 1.0 / s
-    for i in range(a.size):
-        r[i] *= scale
-        f[i] = a[i] * r[i]
-    return shift + math.log(s)
+    for i in range(number.size):
+        s += f[before, i] * E[first + number[i]]
+    if s > _SMALL and s < np.inf:
+        scale = 1.0 / s
+        for i in range(number.size):
+            r[0, i] = scale * E[first + number[i]]
+            f[after, i] = f[before, i] * r[0, i]
+        return s, shift
+    s, shift = _update_by_logs(number, log_p, first, f, before, r)
+    if not (s > 0.0 and s < np.inf):
+        return np.nan, shift
+    for i in range(number.size):
+        r[0, i] /= s
+        f[after, i] = f[before, i] * r[0, i]
+    return s, shift
 
 
 @njit_internal
-def _update_by_logs(chain, log_p, a, r):
+def _update_by_logs(number, log_p, first, f, before, r):
     """Write densities over the largest of a possible state; return their mean, and its log."""
     largest, s = -np.inf, 0.0
-    for i in range(a.size):
-        value = log_p[chain.emission_number[i]]
-        if a[i] > 0.0 and value > largest:
+    for i in range(number.size):
+        value = log_p[0, first + number[i]]
+        if f[before, i] > 0.0 and value > largest:
             largest = value
-    for i in range(a.size):
-        value = log_p[chain.emission_number[i]]
-        r[i] = 0.0
+    for i in range(number.size):
+        value = log_p[0, first + number[i]]
+        r[0, i] = 0.0
         if largest > -np.inf and value > -np.inf:
-            r[i] = math.exp(min(value - largest, _MOST))
-            s += a[i] * r[i]
+            r[0, i] = math.exp(min(value - largest, _MOST))
+            s += f[before, i] * r[0, i]
     return s, largest
 
 
 @njit_internal
-def _why(chain, log_p, a):
+def _why(number, log_p, first, f, before):
     """Why an observation has no density at the possible states."""
-    for i in range(a.size):
-        if a[i] > 0.0 and log_p[chain.emission_number[i]] == -np.inf:
+    for i in range(number.size):
+        if f[before, i] > 0.0 and log_p[0, first + number[i]] == -np.inf:
             return np.int64(ZERO_DENSITY)
     return np.int64(OBSERVATION_UNDEFINED)
 
@@ -127,50 +144,64 @@ def _why(chain, log_p, a):
 @njit_internal
 def forward_pass(chain, record, terms, tape):
     """Write terms and the tape: (NONE, its rows), or (a reason, the failing observation)."""
-    steps, K, D = record.steps, chain.n_states, chain.emission_X.shape[1]
-    a, f, r, P = np.empty(K), np.empty(K), np.empty(K), np.empty((1, chain.move_X.shape[1]))
-    X, Z, log_p = new_block(chain)
-    shifts, E = np.empty(chain.n_at_once), np.empty(log_p.size)
+    shifts = np.zeros(terms.size)
+    code, end = _along(chain, record, terms, shifts, tape)
+    for j in range(terms.size if code == NONE else end):
+        terms[j] = shifts[j] + log(terms[j])
+    return code, end
+
+
+@njit_internal
+def _along(chain, record, means, shifts, tape):
+    """The same with the mean s of an observation's densities, and the log of its unit.
+
+    Arrays are taken out of their tuples before the loop, and no part of one is taken in it: both
+    would count references there.
+    """
+    steps, observed, inputs = record.steps, record.observed, record.inputs
+    origin, first_move, number = chain.origin, chain.first_move, chain.emission_number
+    f, r, now = np.empty((2, chain.n_states)), np.empty((1, chain.n_states)), 0
+    different, P = room_for_moves(chain)
+    n_at_once, X, Z, log_p = new_block(chain, steps.size)
+    D, E, shift_of_row = X.shape[1] // n_at_once, np.empty(X.shape[1]), np.empty(n_at_once)
     if chain.failure != NONE:
         return np.int64(chain.failure), np.int64(0)
-    code = start_probabilities(chain, record.inputs, f)
+    code = start_probabilities(chain, inputs, f[0])
     if code == NONE and chain.is_invariant:
-        code = move_probabilities(chain, record.inputs, 0, record.t0, P)
+        code = move_probabilities(chain, inputs, 0, record.t0, different, P)
     if code != NONE:
         return code, np.int64(0)
-    k, place, block = np.int64(0), np.int64(0), np.int64(0)
+    k, place, row = np.int64(0), np.int64(0), n_at_once
     for j in range(steps.size):
         while k < steps[j]:
             if not chain.is_invariant:
-                code = move_probabilities(chain, record.inputs, k, record.t0, P)
+                code = move_probabilities(chain, inputs, k, record.t0, different, P)
                 if code != NONE:
                     return code, np.int64(j)
-            copy_row(tape, place, f)
-            predict(chain, P, f, a)
-            a, f = f, a
+            _copy_row(tape, place, f, now)
+            _predict(origin, first_move, P, f, now, 1 - now)
+            now = 1 - now
             place += 1
             k += 1
-        if j == block:
-            at, t = load_block(chain, record, j, Z)
-            call_members(chain.emission, chain.c, record.inputs, at, t, Z, X, log_p)
-            _densities(log_p, D, shifts, E)
-            block += chain.n_at_once
-        if is_missing(record.observed, j):
-            terms[j] = 0.0
-            continue
-        a, f = f, a
-        row = (chain.n_at_once - (block - j)) * D
-        logs = log_p[0, row : row + D]
-        term = _update(
-            chain, E[row : row + D], shifts[chain.n_at_once - (block - j)], logs, a, r, f
-        )
-        if not np.isfinite(term):
-            return _why(chain, logs, a), np.int64(j)
-        terms[j] = term
-        copy_row(tape, place, a)
-        copy_row(tape, place + 1, r)
-        place += 2
-    copy_row(tape, place, f)
+        if row == n_at_once:
+            at, t = load_block(chain, record, j, n_at_once, Z)
+            call_members(chain.emission, chain.c, inputs, at, t, Z, X, log_p)
+            _densities(log_p, D, shift_of_row, E)
+            row = 0
+        if is_missing(observed, j):
+            means[j] = 1.0
+        else:
+            first = row * D
+            s, shift = _update(number, E, log_p, first, shift_of_row[row], f, now, 1 - now, r)
+            if np.isnan(s):
+                return _why(number, log_p, first, f, now), np.int64(j)
+            means[j], shifts[j] = s, shift
+            _copy_row(tape, place, f, now)
+            _copy_row(tape, place + 1, r, 0)
+            now = 1 - now
+            place += 2
+        row += 1
+    _copy_row(tape, place, f, now)
     return np.int64(NONE), place + 1
 
 

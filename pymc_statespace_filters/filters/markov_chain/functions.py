@@ -27,6 +27,7 @@ from ...compiler.codegen.scalarize import NotUnrollableError
 from ...compiler.lowering.finite_states import (
     Declared,
     FiniteStates,
+    Moves,
     finite_states,
     sources_of,
     start_symbols,
@@ -59,7 +60,7 @@ def chain_functions(system: System, declared: Declared) -> ChainFunctions:
     start = _Function("start", *_start(model), c, system.n_theta)
     move = _Function("move", *_move(model), c, system.n_theta)
     emission = _Function("emission", *_emission(model), c, system.n_theta)
-    moves, table = found.step, _states(found, model.n)
+    moves, table = _by_successor(found.step), _states(found, model.n)
     of_move = move.distinct(table[moves.origin], moves.values)
     of_state = emission.distinct(table)
     settings = sizes_and_tables(
@@ -79,6 +80,12 @@ def chain_functions(system: System, declared: Declared) -> ChainFunctions:
             "update_back": emission.derivative(),
         },
     )  # fmt: skip
+
+
+def _by_successor(moves: Moves) -> Moves:
+    """The moves in the order of the states that they lead to."""
+    order = np.argsort(moves.successor, kind="stable")
+    return Moves(moves.origin[order], moves.values[order], moves.successor[order])
 
 
 def _states(found: FiniteStates, n: int) -> np.ndarray:
@@ -114,7 +121,9 @@ def _product(law: TensorVariable, n_v: int) -> TensorVariable:
 def _emission(model: StateSpaceModel) -> tuple[dict[str, TensorVariable], TensorVariable]:
     """log p(d | x), of theta, x, u, t and the observation z."""
     symbols = symbols_of(model)
-    density = observation_log_density(model, {i: symbols[i] for i in ("theta", *"xutd")})
+    given = {i: symbols[i] for i in ("theta", *"xutd")}
+    # Rows that are wholly missing are not evaluated.
+    density = observation_log_density(model, given, is_complete=model.p == 1)
     return {**{i: symbols[i] for i in ("theta", *"xut")}, "z": symbols["d"]}, density
 
 

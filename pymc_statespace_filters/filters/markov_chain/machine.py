@@ -54,7 +54,8 @@ def sizes_and_tables(
 class Chain(NamedTuple):
     """One evaluation: the tables, the functions by address, and the constants ``c``.
 
-    Of ``n_states`` states, X has the columns. Moves go from ``origin`` to ``successor``, with the
+    Of ``n_states`` states, X has the columns. The moves to state i are those from ``first_move[i]``
+    to ``first_move[i + 1]``, exclusive. Moves go from ``origin`` to ``successor``, with the
     probability number ``move_number``, a function of the columns of ``move_X`` and ``move_V``; the
     log-density of an observation in a state is number ``emission_number`` of those at
     ``emission_X``. ``..._rows`` are the elements of theta in the rows of derivatives.
@@ -69,6 +70,7 @@ class Chain(NamedTuple):
     X: np.ndarray
     origin: np.ndarray
     successor: np.ndarray
+    first_move: np.ndarray
     move_X: np.ndarray
     move_V: np.ndarray
     move_number: np.ndarray
@@ -112,12 +114,17 @@ def read_chain(plan, theta, inputs):
     for i in range(len(lengths)):
         at[i + 1] = at[i] + lengths[i]
     n_at_once = 1 if size[11] != 0 else max(_AT_ONCE // D, 1)
+    successor, first_move = _whole(settings[at[2] :], M), np.zeros(K + 1, np.int64)
+    for m in range(M):
+        first_move[successor[m] + 1] = m + 1
+    for i in range(K):  # to a state without moves lead none
+        first_move[i + 1] = max(first_move[i + 1], first_move[i])
     return Chain(
         failure=system.failure, n_states=K, p=plan[PLAN.p],
         dt=plan.view(np.float64)[PLAN.dt], is_invariant=size[10] != 0,
         n_at_once=n_at_once,
         X=settings[at[0] : at[1]].reshape((n, K)),
-        origin=_whole(settings[at[1] :], M), successor=_whole(settings[at[2] :], M),
+        origin=_whole(settings[at[1] :], M), successor=successor, first_move=first_move,
         move_X=settings[at[3] : at[4]].reshape((n, U)),
         move_V=settings[at[4] : at[5]].reshape((n_v, U)),
         move_number=_whole(settings[at[5] :], M),
@@ -157,8 +164,17 @@ def start_probabilities(chain, inputs, first):
 
 
 @njit_internal
-def move_probabilities(chain, inputs, k, t0, out):
-    """Write the probabilities (1, U) of different moves from step k to k + 1."""
-    t = t0 + k * chain.dt
-    call_members(chain.move, chain.c, inputs, k, t, chain.move_V, chain.move_X, out)
-    return np.int64(INVALID_PROBABILITY if np.isnan(out.sum()) else NONE)
+def move_probabilities(chain, inputs, k, t0, different, P):
+    """Write the probabilities P (M,) of all moves from step k to k + 1, with room (1, U)."""
+    t, total = t0 + k * chain.dt, 0.0
+    call_members(chain.move, chain.c, inputs, k, t, chain.move_V, chain.move_X, different)
+    for m in range(P.size):
+        P[m] = different[0, chain.move_number[m]]
+        total += P[m]
+    return np.int64(INVALID_PROBABILITY if np.isnan(total) else NONE)
+
+
+@njit_internal
+def room_for_moves(chain):
+    """Arrays for the probabilities of different moves, (1, U), and of all, (M,)."""
+    return np.empty((1, chain.move_X.shape[1])), np.empty(chain.origin.size)

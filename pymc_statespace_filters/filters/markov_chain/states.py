@@ -19,7 +19,7 @@ from ..calls import OK, first_unknown, opened, reals_at, single_record, wanted_r
 from ..outcomes import NONE, OUT_OF_MEMORY, is_missing
 from ..plan import PLAN
 from .forward import forward_pass, rows_on_tape
-from .machine import move_probabilities, read_chain
+from .machine import move_probabilities, read_chain, room_for_moves
 
 PREDICTED, FILTERED, SMOOTHED = range(3)
 MOMENTS = {"predicted": PREDICTED, "filtered": FILTERED, "smoothed": SMOOTHED}
@@ -76,9 +76,9 @@ def _read_backwards(chain, record, tape, n_taped, rows, seed, probabilities, pat
     """Write the smoothed probabilities at the rows, and a path."""
     steps, K = record.steps, chain.n_states
     b, new, weights = np.ones(K), np.empty(K), np.empty(K)
-    P = np.empty((1, chain.move_X.shape[1]))
+    different, P = room_for_moves(chain)
     if chain.is_invariant:
-        move_probabilities(chain, record.inputs, 0, record.t0, P)
+        move_probabilities(chain, record.inputs, 0, record.t0, different, P)
     place, j, r, drawn = n_taped - 1, steps.size - 1, rows.size - 1, np.int64(0)
     for k in range(steps[-1] if steps.size else 0, -1, -1):
         f = tape[place]
@@ -87,15 +87,14 @@ def _read_backwards(chain, record, tape, n_taped, rows, seed, probabilities, pat
                 weights[i] = f[i]
         else:
             if not chain.is_invariant:
-                move_probabilities(chain, record.inputs, k, record.t0, P)
+                move_probabilities(chain, record.inputs, k, record.t0, different, P)
             for i in range(K):
                 new[i] = weights[i] = 0.0
             for m in range(chain.origin.size):
                 origin, successor = chain.origin[m], chain.successor[m]
-                probability = P[0, chain.move_number[m]]
-                new[origin] += probability * b[successor]
+                new[origin] += P[m] * b[successor]
                 if successor == drawn:
-                    weights[origin] += f[origin] * probability
+                    weights[origin] += f[origin] * P[m]
             b, new = new, b
         drawn = _drawn(weights, uniform_at(seed, STATES, k, 0))
         if r >= 0 and rows[r] == k:
