@@ -6,6 +6,7 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import pytest
+from scipy.stats import norm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
@@ -16,7 +17,7 @@ from pymc_statespace_filters.system.input_columns import divided
 from pymc_statespace_filters.system.integrators.substeps import CoupledNoise
 from pymc_statespace_filters.system.own_units import law_in_own_units, moments_of_members
 from pymc_statespace_filters.system.record import checked_record
-from tests.systems import DOUBLE_WELL_SYSTEM, PAIR, PAIR_DATA, STEPS
+from tests.systems import DOUBLE_WELL_SYSTEM, PAIR, PAIR_DATA, STEPS, log_likelihoods
 
 pytestmark = pytest.mark.usefixtures("interpreted")
 
@@ -121,6 +122,47 @@ def test_without_strength_the_system_is_the_one_without_drift(filter):
     np.testing.assert_allclose(still, constant, rtol=0, atol=1e-12)
     moved = psf.log_likelihood(system, filter, params | {"alpha_strength": 3.0}, **record)
     assert abs(moved - constant).max() > 1e-3
+
+
+def double_well_density(observed, steps, params, dt):
+    """Log-likelihood of the double well whose alpha walks on the log scale, by trapezoids."""
+    x, z = np.arange(-2.6, 2.6, 0.02), np.log(params["alpha"]) + np.arange(-1.4, 1.4, 0.02)
+    sd_x, sd_z = params["sigma"] * np.sqrt(dt), params["alpha_strength"] * np.sqrt(dt)
+
+    def moved(slope):
+        return norm.pdf(x[:, None], x + dt * (slope * x + params["beta"] * x**3), sd_x) * 0.02
+
+    to_x = np.stack([moved(slope) for slope in np.exp(z)])
+    to_z = norm.pdf(z[:, None], z, sd_z) * 0.02
+    density = norm.pdf(x, params["initial_mean"], np.sqrt(params["initial_var"]))
+    density = np.outer(norm.pdf(z, z[70], sd_z), moved(params["alpha"]) @ density)
+    assert steps[0] > 0
+    total = 0.0
+    for k in range(1, steps[-1] + 1):
+        if k > 1:
+            density = to_z @ np.einsum("zyx,zx->zy", to_x, density)
+        if k in steps:
+            seen = observed[list(steps).index(k)]
+            density = density * norm.pdf(seen, x, np.sqrt(params["noise_var"]))
+            mass = density.sum() * 0.02**2
+            total, density = total + np.log(mass), density / mass
+    return total
+
+
+def test_a_drifting_slope_of_a_double_well_has_the_likelihood_of_a_quadrature():
+    system = psf.drifting(DOUBLE_WELL_SYSTEM, alpha=psf.RandomWalk(scale="log"))
+    params = {
+        "alpha": 1.5, "alpha_strength": 0.6, "beta": -1.0, "sigma": 0.6, "noise_var": 0.01,
+        "initial_mean": 0.8, "initial_var": 0.04,
+    }  # fmt: skip
+    steps, observed = np.array([10, 30, 50, 70]), np.array([1.1, 1.5, 1.6, 1.2])
+    exact = double_well_density(observed, steps, params, system.dt)
+    for filter in (psf.BootstrapPF(4000), psf.GuidedPF(1000)):
+        logs = log_likelihoods(system, filter, params, range(40), observed=observed, steps=steps)
+        ratios = np.exp(logs - exact)
+        error = ratios.std(ddof=1) / np.sqrt(len(ratios))
+        assert error < 0.03
+        assert abs(ratios.mean() - 1) < 4 * error  # of right filters 1 in 10^4
 
 
 def test_elements_and_arrays_of_parameters_drift():
