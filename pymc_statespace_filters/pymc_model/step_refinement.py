@@ -94,7 +94,9 @@ def _halved(node: Any, halvings: int) -> list[list[Variable]]:
     systems = [system.with_integrator(integrator) for integrator in integrators]
     if not filter.noisy:
         return [_likelihood(node, version) for version in systems]
-    if system.m and [s.m for s in systems] == [system.m * 2**i for i in range(halvings + 1)]:
+    # Parameters drift once a step, whatever its substeps.
+    noises = [one.m - len(one.drifting) for one in systems]
+    if noises[0] and noises == [noises[0] * 2**i for i in range(halvings + 1)]:
         coupled = [
             CoupledNoise(integrator, 2 ** (halvings - i)) if i < halvings else integrator
             for i, integrator in enumerate(integrators)

@@ -61,7 +61,8 @@ def filtered_states(
         of the state; dims (chain, draw, d_time, state). ``d_n_effective`` (chain, draw, d_time) is
         the effective number of particles or members, infinite for a deterministic filter. All are
         NaN where the filter failed. Over all draws, the posterior mean is the mean of ``d_mean``,
-        and the variance is the mean of ``d_sd**2`` plus the variance of ``d_mean``. Of a panel the
+        and the variance is the mean of ``d_sd**2`` plus the variance of ``d_mean``. Those of a
+        drifting parameter are of a normal law on its scale, see `drifting`. Of a panel the
         dimension is d_obs, the rows of all records, with the coordinates ``d_panel`` and
         ``d_time``.
 

@@ -59,8 +59,8 @@ def symbolic_panel_inputs(
         return panel_inputs(inputs, system, records, axes)
     if system.n_input_columns > system.n_inputs:
         raise ModelError(
-            "inputs must be numbers in a panel of a system with accumulators or at times off the "
-            "grid, got a symbol"
+            "inputs must be numbers in a panel of a system with accumulators, with parameters that "
+            "are held for several steps, or at times off the grid, got a symbol"
         )
     current = [
         part.get_value() if isinstance(part, SharedVariable) else part
@@ -185,7 +185,8 @@ def symbolic_panel(system: StateSpaceModel, given: GivenRecord) -> SymbolicPanel
     if is_symbolic and system.n_input_columns > system.n_inputs:
         raise ModelError(
             "panel and steps must be numbers for a system with accumulators, which are reset at the"
-            " steps of each record, and at times off the grid, got pm.Data"
+            " steps of each record, with parameters that are held for several steps, and at times "
+            "off the grid, got pm.Data"
         )
     rows_of_user = placed.inputs if placed.timed else given.inputs
     forces, first_inputs = symbolic_panel_inputs(rows_of_user, system, records, axes)

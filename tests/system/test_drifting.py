@@ -11,7 +11,11 @@ from scipy.stats import norm
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.errors import FilterWarning, ModelError
-from pymc_statespace_filters.pymc_model.step_refinement import path_eigenvalues
+from pymc_statespace_filters.pymc_model.density import RowFunction
+from pymc_statespace_filters.pymc_model.step_refinement import (
+    densities_by_halvings,
+    path_eigenvalues,
+)
 from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.input_columns import divided
 from pymc_statespace_filters.system.integrators.substeps import CoupledNoise
@@ -235,6 +239,23 @@ def test_integrators_of_shorter_steps_keep_the_drift():
     rows = np.column_stack([PUSH, np.arange(20) % 2])[None]
     eigenvalues = path_eigenvalues(system, theta, np.array([[20]]), rows, np.zeros(1))
     np.testing.assert_allclose(sorted(eigenvalues[0, 0].real), [1 - 1.2 * DT / 2, 1.0])
+
+
+def test_lengths_of_a_step_are_compared_with_one_path_of_the_noise():
+    """By plain particles, the estimates differ by the step and not by the noise."""
+    system = psf.drifting(pushed(), gain=psf.RandomWalk())
+    with pm.Model() as model:
+        pm.HalfNormal("a")
+        params = {"gain": 0.7, "gain_strength": 0.3}
+        filter = psf.BootstrapPF(200)
+        psf.StateSpace(
+            "d", system, filter, steps=GRID, observed=DATA, inputs=PUSH, params=params
+        )  # fmt: skip
+        densities = densities_by_halvings(model, 1)
+        coarse, fine = (RowFunction(model, density) for density in densities)
+    seeds = np.arange(20)[:, None]
+    found = [one.evaluate(np.zeros((20, 1)), seeds) for one in (coarse, fine)]
+    assert np.std(found[1] - found[0]) < 0.2 * np.std(found[0])
 
 
 def test_the_column_of_a_held_parameter_moves_once_in_a_divided_step():
