@@ -19,7 +19,9 @@ from .evidence import (
 )
 from .filters import (
     EKF,
+    IMM,
     IPLF,
+    RBPF,
     UKF,
     BootstrapPF,
     EnKF,
@@ -73,7 +75,9 @@ __version__: str
 __all__ = [
     "DRAM",
     "EKF",
+    "IMM",
     "IPLF",
+    "RBPF",
     "UKF",
     "BootstrapPF",
     "EnKF",

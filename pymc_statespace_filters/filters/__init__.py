@@ -14,6 +14,7 @@ from .ensemble.particle_filter import ParticleFilter, particle_filter
 from .finite_state import FiniteStateFilter
 from .grid import GridFilter
 from .guided_pf import GuidedPF
+from .imm import IMM
 from .iplf import IPLF
 from .pf_enkf import PFEnKF
 from .protocol import (
@@ -28,11 +29,14 @@ from .protocol import (
     System,
     ToleranceFilter,
 )
+from .rbpf import RBPF
 from .ukf import UKF
 
 __all__ = [
     "EKF",
+    "IMM",
     "IPLF",
+    "RBPF",
     "UKF",
     "BatchFilter",
     "BootstrapPF",

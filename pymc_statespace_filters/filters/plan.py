@@ -81,6 +81,9 @@ class PlanSlots(NamedTuple):
     root_of_observation_noise: int = N_HEADER + 52
     follows_origins: int = N_HEADER + 53  # of particles that no noise tells apart
     is_linear: int = N_HEADER + 54  # of guided filters: one guide is right everywhere
+    # of particles with Kalman filters, see `regimes.particles`
+    condition: int = N_HEADER + 55
+    move_to_observation: int = N_HEADER + 56
 
 
 PLAN = PlanSlots()

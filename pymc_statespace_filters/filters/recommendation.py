@@ -17,15 +17,17 @@ from .finite_state import FiniteStateFilter
 from .gaussian.base import GaussianFilterBase
 from .grid import GridFilter
 from .guided_pf import GuidedPF
+from .imm import IMM
 from .iplf import IPLF
 from .pf_enkf import PFEnKF
 from .protocol import EnsembleFilter, Filter, System, check_filter
+from .rbpf import RBPF
 from .ukf import UKF
 
 # In the order in which messages name them, with a first number of particles.
 FILTERS: tuple[Filter, ...] = (
-    EKF(), FiniteStateFilter(), GridFilter(), IPLF(), UKF(), GuidedPF(100), BootstrapPF(1000),
-    PFEnKF(1000), EnKF(1000),
+    EKF(), FiniteStateFilter(), GridFilter(), IPLF(), UKF(), IMM(), RBPF(100), GuidedPF(100),
+    BootstrapPF(1000), PFEnKF(1000), EnKF(1000),
 )  # fmt: skip
 
 # Particles that take as long as what does not depend on their number: a guide, or the calls of a
@@ -110,8 +112,8 @@ def jump_problem(system: System, filter: Any) -> str | None:
 
     A drift that jumps moves the state by little in a step, and sigma points follow that.
     """
-    linearises = isinstance(filter, GaussianFilterBase) and not system.is_deterministic
-    jumping = system.jumping_equations if linearises else ()
+    linearises = isinstance(filter, GaussianFilterBase | RBPF) and not system.is_deterministic
+    jumping = filter.linearised(system).jumping_equations if linearises else ()
     if not isinstance(filter, EKF) and system.model.integrator is not None:
         jumping = tuple(name for name in jumping if name != "transition")
     if not jumping:

@@ -163,10 +163,14 @@ def gradient_obstacle(model: pm.Model) -> str:
 
 
 def kinked_variable(model: pm.Model) -> str | None:
-    """The StateSpace variable whose equations have kinks or jumps, or may have."""
+    """The StateSpace variable whose likelihood has kinks or jumps, or may have."""
     nodes = state_space_nodes(model).items()
-    kinked = (name for name, node in nodes if not compile_system(node.op.system).is_smooth)
-    return next(kinked, None)
+    return next((name for name, node in nodes if not _is_smooth(node.op)), None)
+
+
+def _is_smooth(op: Any) -> bool:
+    system, of_filter = compile_system(op.system), getattr(op.filter, "is_smooth_for", None)
+    return system.is_smooth if of_filter is None else of_filter(system)
 
 
 def exactness(model: pm.Model) -> bool:

@@ -75,7 +75,7 @@ class CompiledSystem:
 
     def __init__(self, written: StateSpaceModel) -> None:
         found = lowered(written)
-        self._written, self.model = written, found.model
+        self.written, self.model = written, found.model
         model = self.model
         self._extension = found.extension
         self.n, self.p, self.r = model.n, model.p, model.r
@@ -93,13 +93,13 @@ class CompiledSystem:
         self._covariances = covariances(model, self._merged_noise)
         sizes = {name: g.outputs[0].type.shape[0] for name, g in self._covariances.items()}
         self.n_constants = self.n_theta + self.n + sum(size**2 for size in sizes.values())
-        self._c = pt.tensor("c", shape=(self.n_constants,), dtype="float64")
-        self._symbols = symbols_of(model) | {"theta": self._c[: self.n_theta]}
+        self.constants = pt.tensor("c", shape=(self.n_constants,), dtype="float64")
+        self._symbols = symbols_of(model) | {"theta": self.constants[: self.n_theta]}
         self.square_roots, self._square_roots = {}, {}
         start = self.n_theta + self.n
         for name, size in sizes.items():
             self.square_roots[name] = start
-            self._square_roots[name] = self._c[start : start + size**2].reshape((size, size))
+            self._square_roots[name] = self.constants[start : start + size**2].reshape((size, size))
             start += size**2
 
     # Constants of an evaluation
@@ -127,7 +127,7 @@ class CompiledSystem:
     @cached_property
     def prepare(self) -> ParameterFunction:
         """Theta -> c."""
-        given = theta = pt.tensor("theta", shape=(self._written.n_theta,), dtype="float64")
+        given = theta = pt.tensor("theta", shape=(self.written.n_theta,), dtype="float64")
         if self._extension is not None:
             (theta,) = self._extension.bind([given])
         mean = call(self.model.equations.initial_mean, self.model, {"theta": theta})
@@ -137,7 +137,7 @@ class CompiledSystem:
     @cached_property
     def initialise(self) -> MemberFunction:
         """Draw the state at step 0."""
-        z, mean = _normals(self.n_start), self._c[self.n_theta : self.n_theta + self.n]
+        z, mean = _normals(self.n_start), self.constants[self.n_theta : self.n_theta + self.n]
         draw = self.model.equations.initial_draw
         if draw is None:
             # Drifting parameters, the last states, have a known start.
@@ -164,7 +164,7 @@ class CompiledSystem:
         gains = pt.tensor("gains", shape=(n_gains(n, m),), dtype="float64")
         noise, log_ratio = guided_noise(gains, member[:n], z)
         moved = pt.concatenate([self._step(member[:n], noise), [member[n] + log_ratio]])
-        inputs = {"theta": self._c, "u": self._symbols["u"], "t": self._symbols["t"]}
+        inputs = {"theta": self.constants, "u": self._symbols["u"], "t": self._symbols["t"]}
         graph = Graph(inputs | {"x": member, "z": z, "gains": gains}, [moved])
         arguments = "c, inputs, k, t, gains, Z, X"
         return member_function("propagate_guided", arguments, graph, "X")
@@ -174,7 +174,7 @@ class CompiledSystem:
         """The next state and its Jacobians, at points with the same noise."""
         x, noise = self._symbols["x"], pt.tensor("noise", shape=(self.m,), dtype="float64")
         linearized = linearize_step(self._step(x, noise), x, noise, self.free)
-        inputs = {"theta": self._c, **{i: self._symbols[i] for i in "xut"}, "noise": noise}
+        inputs = {"theta": self.constants, **{i: self._symbols[i] for i in "xut"}, "noise": noise}
         arguments = "c, inputs, k, t, noise, X, out"
         graph = Graph(inputs, [linearized])
         return member_function("linearized_step", arguments, graph, "out")
@@ -183,7 +183,7 @@ class CompiledSystem:
     def observation_information(self) -> MemberFunction:
         """log p(d | x), its score and its information, at one state."""
         information = observation_information(self.model, self._given("xutd"), self.free)
-        inputs = {"theta": self._c, **{i: self._symbols[i] for i in "xutd"}}
+        inputs = {"theta": self.constants, **{i: self._symbols[i] for i in "xutd"}}
         arguments, graph = "c, inputs, k, t, d, X, out", Graph(inputs, [information])
         return member_function("observation_information", arguments, graph, "out", vector=False)
 
@@ -242,7 +242,7 @@ class CompiledSystem:
     def _member_function(
         self, name: str, arguments: str, output: TensorVariable, target: str, inputs: str = "", **z
     ) -> MemberFunction:
-        graph_inputs = {"theta": self._c, **{i: self._symbols[i] for i in inputs}, **z}
+        graph_inputs = {"theta": self.constants, **{i: self._symbols[i] for i in inputs}, **z}
         return member_function(name, arguments, Graph(graph_inputs, [output]), target)
 
     # Properties
@@ -260,12 +260,12 @@ class CompiledSystem:
     @cached_property
     def with_gaussian_steps(self) -> "CompiledSystem":
         """The system with normal variables in place of others in ``process_dist``."""
-        return compile_system(self._written.with_gaussian_steps)
+        return compile_system(self.written.with_gaussian_steps)
 
     @cached_property
     def gaussian(self) -> "CompiledSystem":
         """The same with a Gaussian start."""
-        return compile_system(self._written.gaussian)
+        return compile_system(self.written.gaussian)
 
     @cached_property
     def is_linear(self) -> bool:

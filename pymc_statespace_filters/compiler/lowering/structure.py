@@ -193,11 +193,16 @@ def is_smooth(system: StateSpaceModel) -> bool:
     if not system.has_gaussian_steps:
         return False
     symbols = symbols_of(system)
-    inputs = [f"x.{i}" for i in range(system.n)]
-    inputs += [f"theta.{i}" for i in range(symbols["theta"].type.shape[0] or 0)]
     equations = [system.equations.transition, system.equations.observation]
     vectors = [call(graph, system, symbols) for graph in equations if graph is not None]
-    return all(_is_smooth(vector, symbols, inputs) for vector in vectors)
+    return all(is_smooth_vector(vector, symbols) for vector in vectors)
+
+
+def is_smooth_vector(vector: TensorVariable, symbols: Mapping[str, TensorVariable]) -> bool:
+    """Whether it has no kink or jump in states or parameters; False where undecided."""
+    sizes = {name: symbols[name].type.shape[0] or 0 for name in ("x", "theta")}
+    inputs = [f"{name}.{i}" for name, size in sizes.items() for i in range(size)]
+    return _is_smooth(vector, symbols, inputs)
 
 
 def _is_smooth(

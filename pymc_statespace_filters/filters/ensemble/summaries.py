@@ -26,7 +26,7 @@ _N_HEADER = 10
 
 
 @inline_always
-def _current_row(integers, event, k):
+def current_row(integers, event, k):
     """The row that step k has, -1 if none or if the event comes too late."""
     header = carray(integers, (_N_HEADER,))
     if event > header[_LAST_EVENT]:  # members before resampling say the same, more exactly
@@ -52,7 +52,7 @@ def _header(call, rows):
 def _summarise(integers, reals, event, j, k, X, log_w, d, D, ancestors):
     header = carray(integers, (_N_HEADER,))
     n, N, n_rows = header[_N], header[_MEMBERS], header[_ROWS]
-    row = _current_row(integers, event, k)
+    row = current_row(integers, event, k)
     if row >= 0:
         members = carray(X, (n, N))
         w = finite_weights(members, carray(log_w, (N,)))
@@ -63,7 +63,7 @@ def _summarise(integers, reals, event, j, k, X, log_w, d, D, ancestors):
 def _store_members(integers, reals, event, j, k, X, log_w, d, D, ancestors):
     header = carray(integers, (_N_HEADER,))
     n, N = header[_N], header[_MEMBERS]
-    row = _current_row(integers, event, k)
+    row = current_row(integers, event, k)
     if row >= 0:
         members = carray(X, (n, N))
         w = finite_weights(members, carray(log_w, (N,)))
@@ -179,7 +179,7 @@ def forget_row(numbers, n, n_rows, row):
 @njit_internal
 def write_summaries(call, numbers, health, until):
     """Write what rows were summarised to as results; from the step ``until`` on all are unknown."""
-    rows, n, to = wanted_rows(call), call.plan[PLAN.n], call.results
+    rows, n, to = wanted_rows(call), call.results[RESULTS.n_states], call.results
     for row in range(rows.size):
         if rows[row] >= until:
             forget_row(numbers, n, rows.size, row)

@@ -50,6 +50,14 @@ class GaussianFilterBase:
             system.is_deterministic and system.has_exact_observation_density
         )
 
+    def linearised(self, system: System) -> System:
+        """The system that is linearised: all of it."""
+        return system
+
+    def is_smooth_for(self, system: System) -> bool:
+        """Whether the likelihood has no kinks or jumps along a parameter; False if unknown."""
+        return system.is_smooth
+
     def compile(self, system: System) -> PlannedFunction:
         """Compile the log-likelihood."""
         return PlannedFunction(self._plan(system, FORWARD), *LIKELIHOOD_OF_NOISE)

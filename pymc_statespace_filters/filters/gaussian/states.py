@@ -82,19 +82,19 @@ def states_plan(
 
 
 @njit_internal
-def _n_steps(table):
+def n_steps_of(table):
     return table.rows[-1, 0] if table.rows.shape[0] else np.int64(0)
 
 
 @njit_internal
-def _pass(opening, machine, table, health):
+def taped_pass(opening, machine, covariances, table, health):
     """Terms, a tape of all states, and the first step without one."""
     records, to = records_of(opening, machine), opening.results
     n_rows, size = opening.record[RECORD.n_rows], machine.size
     terms = reals_at(to[RESULTS.terms], (n_rows,)) if to[RESULTS.terms] else np.empty(n_rows)
     tape = np.empty(n_states_on_tape(opening, machine, records) * size)
-    n_taped = forward_pass(machine, settings_of(opening.plan), table, records, tape, terms, health)
-    end = _n_steps(table) + 1
+    n_taped = forward_pass(machine, covariances, table, records, tape, terms, health)
+    end = n_steps_of(table) + 1
     if health[0, 1] != NONE:
         # Without valid covariances, not even the start is known.
         end = table.rows[int(health[0, 2]), 0] if n_taped else np.int64(0)
@@ -102,7 +102,7 @@ def _pass(opening, machine, table, health):
 
 
 @njit_internal
-def _new_health(to):
+def new_health(to):
     """The health of the record, with what stays if memory ends."""
     health = reals_at(to[RESULTS.health], (1, HEALTH_SIZE))
     health[0, 0], health[0, 1], health[0, 2] = np.inf, OUT_OF_MEMORY, 0.0
@@ -115,14 +115,14 @@ def _states(plan, record, request, results):
         return status
     rows, to, machine = wanted_rows(opening), opening.results, read_machine(opening.plan)
     n_wanted, n = rows.size, machine.n
-    mean, sd = _room(to[RESULTS.mean], n_wanted, n), _room(to[RESULTS.sd], n_wanted, n)
-    drawn = _room(to[RESULTS.drawn], n_wanted, n)
-    n_effective = _room(to[RESULTS.n_effective_wanted], n_wanted, 1)
-    health = _new_health(to)
+    mean, sd = room(to[RESULTS.mean], n_wanted, n), room(to[RESULTS.sd], n_wanted, n)
+    drawn = room(to[RESULTS.drawn], n_wanted, n)
+    n_effective = room(to[RESULTS.n_effective_wanted], n_wanted, 1)
+    health = new_health(to)
     without_noise = table_of(opening, parameters_of(opening), np.empty((0, 0)), np.empty(0))
     X, Z = _noise(opening, machine, without_noise)
     table = table_of(opening, without_noise.theta, Z, X)
-    tape, end = _pass(opening, machine, table, health)
+    tape, end = taped_pass(opening, machine, settings_of(opening.plan), table, health)
     if opening.plan[PLAN.last_event] == _SMOOTHED:
         n_known = _read_backwards(machine, table, tape, end, rows, mean, sd, drawn)
     else:
@@ -156,7 +156,7 @@ def _read_forwards(n, is_predicted, table, tape, end, rows, mean, sd, drawn):
 def _read_backwards(machine, table, tape, end, rows, mean, sd, drawn):
     """Write smoothed states at the rows; none if the filter failed."""
     m, steps, n, t0 = machine, table.rows[:, 0], machine.n, table.t0
-    n_steps = _n_steps(table)
+    n_steps = n_steps_of(table)
     if end <= n_steps:
         return 0
     work, records = workspace(m), np.zeros((1, N_OF_RECORD), np.int64)
@@ -206,7 +206,7 @@ def _noise(opening, machine, table):
     work, records = workspace(m), np.zeros((1, N_OF_RECORD), np.int64)
     load_parameters(m, table, records, work.W)
     call(m.start, m, 1, work, work.states, work.forces, table.t0, 0, 1)
-    width = BLOCK * (_n_steps(table) // BLOCK + 1)  # a column for each step, in whole blocks
+    width = BLOCK * (n_steps_of(table) // BLOCK + 1)  # a column for each step, in whole blocks
     X, Z = np.empty((m.n, BLOCK)), np.empty((m.n_noises, width))
     _fill(seed, _purpose, _AT_START, 0, X.ctypes.data, m.n, BLOCK)
     _fill(seed, _purpose, _ALONG, 0, Z.ctypes.data, m.n_noises, width)
@@ -248,12 +248,12 @@ def _run(plan, record, request, results):
     if opening.request[REQUEST.sizes_only]:
         return status
     n, n_wanted = machine.n, rows.size
-    mean, cov = _room(to[RESULTS.mean], n_wanted, n), _room(to[RESULTS.cov], n_wanted, n * n)
-    sd, drawn = _room(to[RESULTS.sd], n_wanted, n), _room(to[RESULTS.drawn], n_wanted, n)
-    n_effective = _room(to[RESULTS.n_effective_wanted], n_wanted, 1)
-    health = _new_health(to)
+    mean, cov = room(to[RESULTS.mean], n_wanted, n), room(to[RESULTS.cov], n_wanted, n * n)
+    sd, drawn = room(to[RESULTS.sd], n_wanted, n), room(to[RESULTS.drawn], n_wanted, n)
+    n_effective = room(to[RESULTS.n_effective_wanted], n_wanted, 1)
+    health = new_health(to)
     table = table_of(opening, parameters_of(opening), np.empty((0, 0)), np.empty(0))
-    tape, end = _pass(opening, machine, table, health)
+    tape, end = taped_pass(opening, machine, settings_of(opening.plan), table, health)
     steps, j = table.rows[:, 0], 0
     for r in range(n_wanted):
         if rows[r] >= end:
@@ -271,7 +271,7 @@ def _run(plan, record, request, results):
                 cov[r, a * n + b] = cov[r, b * n + a] = covariance
         n_effective[r, 0] = np.inf
     if to[RESULTS.state] != 0:
-        state, k = reals_at(to[RESULTS.state], (1 + machine.size,)), _n_steps(table)
+        state, k = reals_at(to[RESULTS.state], (1 + machine.size,)), n_steps_of(table)
         set_all(state, np.nan)
         if health[0, 1] == NONE:
             state[0] = k
@@ -280,7 +280,7 @@ def _run(plan, record, request, results):
 
 
 @njit_internal
-def _room(address, n_rows, width):
+def room(address, n_rows, width):
     """A matrix of NaN: at an address, or elsewhere where it is not wanted."""
     room = reals_at(address, (n_rows, width)) if address else np.empty((n_rows, width))
     set_all(room.reshape(room.size), np.nan)

@@ -1,0 +1,1 @@
+"""Hybrid systems: regimes beside continuous states, which are Gaussian given them."""

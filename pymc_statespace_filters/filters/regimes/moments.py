@@ -1,0 +1,69 @@
+"""Moments and draws of a weighted mixture over regimes, a column for each of its parts.
+
+A column holds a regime, then mean and lower triangle of the covariance of the continuous states.
+``order`` tells where each state of the system is among the finite states, followed by the others.
+"""
+
+import math
+
+import numpy as np
+
+from ...compiler.native.jit import njit_internal
+from ...compiler.numerics.philox import STATES, uniform_at
+from ...compiler.numerics.small_cholesky import covariance_root
+from ..ensemble.summaries import choose
+
+
+@njit_internal
+def mixture_moments(w, X, n_finite, order, spread, mean, cov):
+    """Mean and covariance of the whole state; that between the parts is divided by ``spread``."""
+    n = order.size
+    for a in range(n):
+        mean[a] = 0.0
+        for i in range(w.size):
+            if w[i] > 0.0:
+                mean[a] += w[i] * X[order[a], i]
+    for a in range(n):
+        for b in range(a + 1):
+            within, between = 0.0, 0.0
+            row = _row_of_cov(n, n_finite, order[a], order[b])
+            for i in range(w.size):
+                if w[i] > 0.0:
+                    between += w[i] * (X[order[a], i] - mean[a]) * (X[order[b], i] - mean[b])
+                    within += w[i] * X[row, i] if row >= 0 else 0.0
+            cov[a, b] = cov[b, a] = within + (between / spread if spread > 0.0 else 0.0)
+
+
+@njit_internal
+def _row_of_cov(n, n_finite, a, b):
+    """The row of the covariance of two numbers of a column; -1 if one is known given the regime."""
+    i, j = max(a, b) - n_finite, min(a, b) - n_finite
+    return n + i * (i + 1) // 2 + j if j >= 0 else -1
+
+
+@njit_internal
+def draw_of_mixture(w, X, n_finite, order, seed, place, out):
+    """A draw of the whole state, that of ``place``."""
+    n, part = order.size, choose(w, uniform_at(seed, STATES, place, 0))
+    n_normal = n - n_finite
+    root, drawn = np.empty((n_normal, n_normal)), np.empty(n)
+    for i in range(n_normal):
+        for j in range(i + 1):
+            row = _row_of_cov(n, n_finite, n_finite + i, n_finite + j)
+            root[i, j] = root[j, i] = X[row, part]
+    covariance_root(root)
+    for a in range(n):
+        drawn[a] = X[a, part]
+    for j in range(n_normal):
+        z = _normal(seed, place, j)
+        for i in range(j, n_normal):
+            drawn[n_finite + i] += root[i, j] * z
+    for a in range(n):
+        out[a] = drawn[order[a]]
+
+
+@njit_internal
+def _normal(seed, place, j):
+    """Box and Muller's normal of two uniform numbers of their own."""
+    u, v = uniform_at(seed, STATES, place, 1 + 2 * j), uniform_at(seed, STATES, place, 2 + 2 * j)
+    return math.sqrt(-2.0 * math.log(u)) * math.cos(2.0 * math.pi * v)

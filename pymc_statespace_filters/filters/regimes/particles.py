@@ -1,0 +1,215 @@
+"""A hybrid system as a Rao-Blackwellised particle filter sees it: as that of its particles.
+
+A particle is one vector: a regime, then mean and covariance of the continuous states given all its
+regimes so far. One normal decides what the finite variables of a step are: the first of their
+joint values at which the cumulated probability exceeds that of the normal.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+
+import numpy as np
+import pytensor.tensor as pt
+from pytensor.graph.fg import FrozenFunctionGraph
+from pytensor.graph.replace import graph_replace
+from pytensor.tensor.variable import TensorVariable
+
+from ...compiler.codegen.function_types import Graph, MemberFunction
+from ...compiler.codegen.functions import member_function
+from ...compiler.lowering.compiled_system import CompiledSystem, compile_system
+from ...compiler.lowering.symbols import SYMBOLS, symbols_of
+from ...system.model import StateSpaceModel
+from ...system.quantiles import normal_probability
+from ..gaussian.linearization import (
+    Linearization,
+    linearizations_of,
+    pack,
+    predict,
+    state_size,
+    update,
+)
+from .hybrid import Hybrid, Symbols, hybrid_of
+
+
+@dataclass(frozen=True, eq=False)
+class HybridParticles:
+    """The system of the particles, and what an observation does to them.
+
+    Attributes
+    ----------
+    hybrid : Hybrid
+    system : CompiledSystem
+        Its state is a particle, its noise one normal.
+    """
+
+    hybrid: Hybrid
+    system: CompiledSystem
+    linearization: Linearization
+
+    @cached_property
+    def condition(self) -> MemberFunction:
+        """Condition every particle on an observation; log p(d) of each goes to a row below it."""
+        equations = _Equations(self.hybrid, self.linearization)
+        regime, state = equations.parts(equations.particle)
+        state, term = equations.updated(equations.values, regime, state)
+        outputs = pt.concatenate([regime, state, [term]])
+        return self._function("condition", "c, inputs, k, t, d, X", equations, outputs, "utd", {})
+
+    @cached_property
+    def move_to_observation(self) -> MemberFunction:
+        """Move every particle one step by a regime drawn given the observation behind it.
+
+        The log of the density of the observation given the particle before goes to a row below it.
+        ``gains`` are the observation, the inputs at its step, and its time.
+        """
+        equations = _Equations(self.hybrid, self.linearization)
+        p, n_inputs = self.hybrid.system.p, self.hybrid.system.n_input_columns
+        seen = pt.tensor("gains", shape=(p + n_inputs + 1,), dtype="float64")
+        later = {"d": seen[:p], "u": seen[p : p + n_inputs], "t": seen[p + n_inputs]}
+        outputs = equations.moved_to_observation({**equations.values, **later})
+        others = {"z": equations.z, "gains": seen}
+        arguments = "c, inputs, k, t, gains, Z, X"
+        return self._function("move_to_observation", arguments, equations, outputs, "ut", others)
+
+    def _function(self, name, arguments, equations, outputs, inputs, others) -> MemberFunction:
+        """The function of particles that are followed by a number in memory."""
+        n = self.system.n
+        longer, c = pt.tensor("x", shape=(n + 1,), dtype="float64"), self.system.constants
+        known = {equations.particle: longer[:n], equations.values["theta"]: c[: self.system.n_theta]}
+        (outputs,) = graph_replace([outputs], known, strict=False)
+        given = {name: equations.values[name] for name in inputs}
+        graph = Graph({"theta": c, "x": longer, **given, **others}, [outputs])
+        return member_function(name, arguments, graph, "X")
+
+
+@lru_cache(maxsize=64)
+def hybrid_particles(system: StateSpaceModel, linearization: Linearization) -> HybridParticles:
+    """The particles of a hybrid system whose Kalman filters have this linearisation."""
+    hybrid = hybrid_of(system)
+    model = _Equations(hybrid, linearization).system()
+    return HybridParticles(hybrid, compile_system(model), linearization)
+
+
+class _Equations:
+    """Steps and updates of one particle, as graphs."""
+
+    def __init__(self, hybrid: Hybrid, linearization: Linearization) -> None:
+        self.hybrid = hybrid
+        self.n_finite = hybrid.regimes.shape[1]
+        self.n = self.n_finite + state_size(hybrid.n)
+        self.values = symbols_of(hybrid.system)
+        self.particle = pt.tensor("x", shape=(self.n,), dtype="float64")
+        self.z = pt.tensor("z", shape=(1,), dtype="float64")
+        given = symbols_of(hybrid.given)
+        given["s"] = pt.tensor("s", shape=(state_size(hybrid.n),), dtype="float64")
+        by = linearizations_of(hybrid.given, linearization)
+        self._given = given
+        self._predicted = predict(by.transition, hybrid.given, given)
+        self._updated = update(by.observation, hybrid.given, given)
+
+    def parts(self, particle: TensorVariable) -> tuple[TensorVariable, TensorVariable]:
+        """Regime, and mean and covariance."""
+        return particle[: self.n_finite], particle[self.n_finite :]
+
+    def predicted(
+        self, values: Symbols, regime: TensorVariable, state: TensorVariable, v: TensorVariable
+    ) -> TensorVariable:
+        """Mean and covariance after a step."""
+        return graph_replace(self._predicted, self._known(values, regime, state, v), strict=False)
+
+    def updated(
+        self, values: Symbols, regime: TensorVariable, state: TensorVariable
+    ) -> tuple[TensorVariable, TensorVariable]:
+        """Mean and covariance given an observation, and its log-density."""
+        known = self._known(values, regime, state)
+        return tuple(graph_replace(list(self._updated), known, strict=False))
+
+    def _known(self, values, regime, state, v=None):
+        named = {**values, "s": state, "u": self.hybrid.inputs(values["u"], regime, v)}
+        return {self._given[name]: named[name] for name in ("theta", "u", "t", "d", "s")}
+
+    def step(self) -> TensorVariable:
+        """The particle after a step."""
+        regime, state = self.parts(self.particle)
+        mean, drawn = state[: self.hybrid.n], [pt.constant(v) for v in self.hybrid.drawn]
+        weights = [self.hybrid.step(self.values, regime, mean, v).drawn.probability for v in drawn]
+        v = self._chosen(weights, drawn)
+        moved = self.predicted(self.values, regime, state, v)
+        return pt.concatenate([self.hybrid.step(self.values, regime, mean, v).regime, moved])
+
+    def moved_to_observation(self, later: Symbols) -> TensorVariable:
+        """The particle after a step and an observation, and the log-density of the latter.
+
+        Every value of the finite variables is tried.
+        """
+        regime, state = self.parts(self.particle)
+        weights, terms, particles = [], [], []
+        for v in map(pt.constant, self.hybrid.drawn):
+            step = self.hybrid.step(self.values, regime, state[: self.hybrid.n], v)
+            forecast = self.predicted(self.values, regime, state, v)
+            analysis, term = self.updated(later, step.regime, forecast)
+            weights.append(step.drawn.probability)
+            terms.append(pt.switch(pt.eq(step.drawn.probability, 0.0), -np.inf, term))
+            particles.append(pt.concatenate([step.regime, analysis]))
+        largest = pt.max(pt.stack(terms))
+        joint = [
+            pt.switch(pt.eq(w, 0.0), 0.0, w * pt.exp(term - largest))
+            for w, term in zip(weights, terms, strict=True)
+        ]
+        log_density = largest + pt.log(_sum(joint))
+        return pt.concatenate([self._chosen(joint, particles), [log_density]])
+
+    def start(self) -> TensorVariable:
+        """A particle at step 0."""
+        starts = self.hybrid.found.start
+        found = [self.hybrid.start(self.values["theta"], pt.constant(v)) for v in starts.values]
+        particles = [pt.concatenate([s.regime, pack(s.mean, s.cov)]) for s in found]
+        return self._chosen([start.drawn.probability for start in found], particles)
+
+    def _chosen(
+        self, weights: Sequence[TensorVariable], vectors: Sequence[TensorVariable]
+    ) -> TensorVariable:
+        """The vector on whose share of the weights the normal falls; NaN where a weight is."""
+        total, below, chosen = _sum(weights), weights[0], vectors[0]
+        place = normal_probability(self.z[0]) * total
+        for i, vector in enumerate(vectors[1:], start=1):
+            chosen = pt.switch(place >= below, vector, chosen)
+            below = below + weights[i]
+        return pt.switch(pt.isnan(total), np.nan, chosen)
+
+    def system(self) -> StateSpaceModel:
+        """A system whose state is a particle."""
+        model, n = self.hybrid.system, self.n
+        symbols = {**self.values, "x": self.particle, "q": self.z, "e": pt.dvector("e")}
+        symbols["e"] = pt.tensor("e", shape=(0,), dtype="float64")
+        _, term = self.updated(self.values, *self.parts(self.particle))
+        inputs = [symbols[name] for name in SYMBOLS]
+
+        def frozen(output: TensorVariable) -> FrozenFunctionGraph:
+            return FrozenFunctionGraph.from_io(inputs, [output])
+
+        columns = tuple(f"column {i}" for i in range(model.n_input_columns))
+        nothing = dict.fromkeys(
+            "gaussian_transition process_noise observation observation_noise observation_draw "
+            "finite_step finite_start".split()
+        )
+        start = FrozenFunctionGraph.from_io([self.values["theta"], self.z], [self.start()])
+        equations = replace(
+            model.equations,
+            **nothing,
+            transition=frozen(self.step()),
+            observation_logp=frozen(pt.atleast_1d(term)),
+            initial_mean=frozen(pt.zeros((n,))),
+            initial_cov=frozen(pt.zeros((n, n))),
+            initial_draw=start,
+        )
+        return model._with(
+            n=n, m=1, r=0, states=tuple(f"particle {i}" for i in range(n)), inputs=columns,
+            n_inputs=len(columns), carried=(), accumulators=(), discrete_noise=False,
+            gaussian_observation=False, keeps_noises=True, equations=equations,
+        )  # fmt: skip
+
+
+def _sum(numbers: Sequence[TensorVariable]) -> TensorVariable:
+    return numbers[0] if len(numbers) == 1 else pt.add(*numbers)

@@ -1,0 +1,316 @@
+"""Filters of systems that switch between regimes, against the enumeration of all paths of these."""
+
+import pickle
+import warnings
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+import pytest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.errors import FilterWarning, ModelError
+from pymc_statespace_filters.testing import kalman_log_likelihood
+from tests.references.regimes import SwitchingSystem
+
+FACTOR, SHIFT, SD, SENSOR = (0.9, 0.5), (0.0, 1.5), (0.3, 0.8), 0.4
+STAY = (0.7, 0.8)
+PARAMS = {"stay_0": STAY[0], "stay_1": STAY[1]}
+STEPS = np.array([0, 1, 3, 4, 5, 7, 8])
+INPUTS = np.array([0.1, -0.3, 0.0, 0.2, 0.5, -0.1, 0.4, 0.0])[:, None]
+RECORD = {"steps": STEPS, "inputs": INPUTS}
+
+
+def of(values, regime):
+    return pt.switch(regime > 0.5, values[1], values[0])
+
+
+def noise(x, stay_0=STAY[0], stay_1=STAY[1]):
+    regime = pm.Bernoulli.dist(pt.switch(x[1] > 0.5, stay_1, 1.0 - stay_0))
+    return [regime, pm.Normal.dist(0.0, of(SD, regime))]
+
+
+def switching(**changes):
+    """One state whose equation depends on the regime that a step leads to."""
+    settings = {
+        "transition": lambda x, q, u: [
+            of(FACTOR, q[0]) * x[0] + of(SHIFT, q[0]) + u[0] + q[1], q[0]
+        ],
+        "process_dist": noise,
+        "observation": lambda x: [x[0]],
+        "observation_noise": [[SENSOR**2]],
+        "initial_dist": lambda: [pm.Normal.dist(0.0, 1.0), pm.Bernoulli.dist(0.5)],
+        "states": ["level", "regime"],
+        "inputs": ["push"],
+        "carried": ["regime"],
+    }  # fmt: skip
+    return psf.StateSpaceModel(**settings | changes)
+
+
+SYSTEM = switching()
+EXACT = SwitchingSystem(
+    P=np.array([[STAY[0], 1 - STAY[0]], [1 - STAY[1], STAY[1]]]),
+    A=np.array(FACTOR)[:, None, None],
+    b=np.array(SHIFT)[:, None],
+    Q=np.square(SD)[:, None, None],
+    H=np.eye(1),
+    R=np.array([[SENSOR**2]]),
+    start=np.array([0.5, 0.5]),
+    mean=np.zeros(1),
+    cov=np.eye(1),
+)
+OBSERVED = psf.simulate(SYSTEM, PARAMS, **RECORD, random_seed=4)["observations"].values
+OBSERVED[3] = np.nan
+
+
+def log_likelihood(filter, system=SYSTEM, params=PARAMS, observed=OBSERVED, **others):
+    with warnings.catch_warnings():  # of few particles, which leave the mean as it is
+        warnings.simplefilter("ignore", FilterWarning)
+        return psf.log_likelihood(system, filter, params, observed, **RECORD | others).sum(axis=-1)
+
+
+def exact_log_likelihood(observed=OBSERVED):
+    return EXACT.log_likelihood(STEPS, observed, INPUTS)
+
+
+def check_mean_likelihood(filter, exact, n_seeds, **others):
+    """One correct test in 370 fails for another choice of the seeds, which are fixed."""
+    estimates = log_likelihood(filter, seed=np.arange(n_seeds), **others)
+    ratios = np.exp(estimates - exact)
+    error = ratios.std() / np.sqrt(n_seeds)
+    assert error < 0.02, error
+    assert abs(ratios.mean() - 1.0) < 3.0 * error, (ratios.mean(), error)
+    return ratios
+
+
+@pytest.mark.parametrize("n_particles", [2, 8])
+def test_the_mean_likelihood_of_particles_is_exact(n_particles):
+    ratios = check_mean_likelihood(psf.RBPF(n_particles), exact_log_likelihood(), 4000)
+    assert ratios.std() > 0.05  # it is an estimate
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("resampling", ["systematic", "multinomial", "sorted"])
+@pytest.mark.parametrize("n_particles", [2, 4, 8])
+def test_the_mean_likelihood_over_many_seeds_is_exact(n_particles, resampling):
+    filter = psf.RBPF(n_particles, resampling=resampling, resample_below=0.9)
+    check_mean_likelihood(filter, exact_log_likelihood(), 20_000)
+
+
+def test_merged_regimes_are_nearly_exact():
+    """Two steps between observations leave 0.12 nats, as there are four paths and two Gaussians."""
+    error = log_likelihood(psf.IMM()) - exact_log_likelihood()
+    assert abs(error) == pytest.approx(0.123, abs=1e-3)
+    for inner in (psf.UKF(), psf.IPLF()):
+        assert log_likelihood(psf.IMM(inner=inner)) == pytest.approx(
+            log_likelihood(psf.IMM()), abs=1e-9
+        )
+
+
+def test_two_observations_are_exact():
+    """Nothing is merged before the second: regimes of the start are told apart by it."""
+    steps, observed = STEPS[:2], OBSERVED[:2]
+    found = psf.log_likelihood(SYSTEM, psf.IMM(), PARAMS, observed, steps=steps, inputs=INPUTS)
+    exact = [EXACT.log_likelihood(steps[:n], observed[:n], INPUTS) for n in (1, 2)]
+    assert found.cumsum() == pytest.approx(exact, abs=1e-12)
+
+
+def test_one_regime_is_a_kalman_filter():
+    system = switching(
+        process_dist=lambda x: [pm.Bernoulli.dist(1.0), pm.Normal.dist(0.0, SD[1])],
+        initial_dist=lambda: [pm.Normal.dist(0.0, 1.0), 1.0],
+    )
+    steps = STEPS
+    exact = kalman_log_likelihood(
+        [[FACTOR[1]]], [[SD[1] ** 2]], [[1.0]], [[SENSOR**2]], [0.0], [[1.0]], steps=steps,
+        observed=OBSERVED, forcing=SHIFT[1] + INPUTS,
+    )  # fmt: skip
+    for filter in (psf.IMM(), psf.RBPF(2)):
+        terms = psf.log_likelihood(system, filter, {}, OBSERVED, **RECORD)
+        assert terms == pytest.approx(exact, abs=1e-12)
+        assert filter.is_exact_for(compile_system(system))
+
+
+def test_a_step_may_depend_on_the_regime_that_it_leaves():
+    system = switching(
+        transition=lambda x, q, u: [of(FACTOR, x[1]) * x[0] + of(SHIFT, x[1]) + u[0] + q[1], q[0]],
+        process_dist=lambda x, stay_0, stay_1: [
+            pm.Bernoulli.dist(pt.switch(x[1] > 0.5, stay_1, 1.0 - stay_0)),
+            pm.Normal.dist(0.0, of(SD, x[1])),
+        ],
+    )
+    exact = _leaving_log_likelihood(EXACT)
+    assert log_likelihood(psf.IMM(), system) == pytest.approx(exact, abs=0.2)
+    check_mean_likelihood(psf.RBPF(8), exact, 4000, system=system)
+
+
+def _leaving_log_likelihood(system):
+    """By enumeration, of steps that depend on the regime before them."""
+    paths, k = [(np.log(p), r, system.mean, system.cov) for r, p in enumerate(system.start)], 0
+    for step, d in zip(STEPS, OBSERVED, strict=True):
+        while k < step:
+            moved = []
+            for log_p, r, mean, cov in paths:
+                mean, cov = system.A[r] @ mean + system.b[r] + INPUTS[k], system.A[r] ** 2 * cov
+                for new in (0, 1):
+                    log_new = log_p + np.log(system.P[r, new])
+                    moved.append((log_new, new, mean, cov + system.Q[r]))
+            paths, k = moved, k + 1
+        paths = [
+            (found[0], r, *found[2:])
+            for log_p, r, mean, cov in paths
+            for found in [system._conditioned(log_p, (r,), mean, cov, d)]
+        ]
+    return np.logaddexp.reduce([path[0] for path in paths])
+
+
+def test_values_of_the_filtered_state():
+    weights, mean, cov = EXACT.last_moments(STEPS, OBSERVED, INPUTS)
+    sd = [np.sqrt(cov[0, 0]), np.sqrt(weights[1] * weights[0])]
+    for filter, tolerance in ((psf.IMM(), 0.005), (psf.RBPF(20_000), 0.01)):
+        run = psf.run_filter(SYSTEM, filter, PARAMS, OBSERVED, **RECORD)
+        last = run.isel(time=-1)
+        assert last["mean"].values == pytest.approx([mean[0], weights[1]], abs=tolerance)
+        assert last["sd"].values == pytest.approx(sd, abs=tolerance)
+
+
+def test_the_gradient_is_that_of_the_value():
+    with pm.Model() as model:
+        stay_0, stay_1 = pm.Uniform("stay_0"), pm.Uniform("stay_1")
+        psf.StateSpace("d", SYSTEM, psf.IMM(), observed=OBSERVED, **RECORD)
+        variables = [stay_0, stay_1]
+        value, slope = model.compile_logp(jacobian=False), model.compile_dlogp(variables, jacobian=False)
+    point = {"stay_0_interval__": 0.8, "stay_1_interval__": -0.3}
+    _check_slope(value, slope, point)
+
+
+def _check_slope(value, slope, point):
+    h, found = 1e-5, slope(point)
+    for i, name in enumerate(point):
+        above, below = (value({**point, name: point[name] + step}) for step in (h, -h))
+        assert found[i] == pytest.approx((above - below) / (2 * h), rel=1e-7, abs=1e-8)
+
+
+def row_of_ring(regime, p):
+    """Probabilities of the regimes after one of three, of which one is never next."""
+    p = pt.as_tensor(p)
+    rows = [pt.stack([1 - p, p, 0.0]), pt.stack([0.0, 1 - p, p]), pt.stack([p, 0.0, 1 - p])]
+    return pt.switch(pt.eq(regime, 0), rows[0], pt.switch(pt.eq(regime, 1), rows[1], rows[2]))
+
+
+RING = switching(
+    transition=lambda x, q, u: [0.5 * x[0] + q[0] + u[0] + q[1], q[0]],
+    process_dist=lambda x, p: [
+        pm.Categorical.dist(row_of_ring(x[1], p)), pm.Normal.dist(0.0, 0.3 + 0.2 * x[1])
+    ],
+    initial_dist=lambda: [pm.Normal.dist(0.0, 1.0), 0.0],
+)  # fmt: skip
+
+
+def test_the_gradient_beside_moves_that_never_happen():
+    with pm.Model() as model:
+        p = pm.Uniform("p")
+        psf.StateSpace("d", RING, psf.IMM(), observed=OBSERVED, **RECORD)
+        value, slope = model.compile_logp(jacobian=False), model.compile_dlogp([p], jacobian=False)
+    _check_slope(value, slope, {"p_interval__": -0.4})
+    # At certain moves, where a probability is zero, one-sided differences.
+    one, h = 1.0 - 1e-9, 1e-6
+    terms = [
+        psf.log_likelihood(RING, psf.IMM(), {"p": v}, OBSERVED, **RECORD).sum()
+        for v in (1.0, one - h, 0.0)
+    ]
+    assert np.isfinite(terms[:2]).all()
+
+
+def test_probabilities_that_depend_on_the_state():
+    """A level above one is likely to switch: no filter of regimes is exact, both are near."""
+    system = switching(
+        process_dist=lambda x: [
+            pm.Bernoulli.dist(pm.math.sigmoid(3.0 * (x[0] - 1.0))), pm.Normal.dist(0.0, 0.3)
+        ]
+    )  # fmt: skip
+    compiled = compile_system(system)
+    assert not psf.RBPF(10).is_exact_for(compiled)
+    assert not psf.IMM().is_exact_for(compiled)
+    plain = log_likelihood(psf.BootstrapPF(20_000), system, {}, seed=np.arange(4)).mean()
+    assert log_likelihood(psf.IMM(), system, {}) == pytest.approx(plain, abs=0.15)
+    assert log_likelihood(psf.RBPF(2000), system, {}) == pytest.approx(plain, abs=0.15)
+
+
+def test_held_noise_is_the_noise_of_its_seed():
+    from tests.filters.ensemble_contract import evaluator
+    from pymc_statespace_filters.ops.likelihood import LogLikelihoodOfNoise, StoredNoise
+
+    filter = psf.RBPF(70)
+    (stored,) = evaluator(StoredNoise(SYSTEM, filter))(STEPS, 5)
+    theta = np.array(list(PARAMS.values()))
+    terms, _ = evaluator(LogLikelihoodOfNoise(SYSTEM, filter))(
+        theta, STEPS, OBSERVED, INPUTS, 0.0, stored
+    )
+    of_seed = psf.log_likelihood(SYSTEM, filter, PARAMS, OBSERVED, **RECORD, seed=5)
+    assert np.array_equal(terms, of_seed)
+
+
+def test_a_filter_goes_on_from_its_state():
+    for filter in (psf.IMM(), psf.RBPF(50)):
+        whole = psf.run_filter(SYSTEM, filter, PARAMS, OBSERVED, **RECORD, seed=3)
+        first = psf.run_filter(
+            SYSTEM, filter, PARAMS, OBSERVED[:4], steps=STEPS[:4], inputs=INPUTS, seed=3
+        )
+        later = psf.run_filter(
+            SYSTEM, filter, PARAMS, OBSERVED[4:], steps=STEPS[4:], inputs=INPUTS, seed=3,
+            state=first,
+        )  # fmt: skip
+        terms = [run["log_likelihood"].values for run in (first, later)]
+        assert np.concatenate(terms) == pytest.approx(whole["log_likelihood"].values, abs=1e-12)
+
+
+REFUSED = [
+    (dict(process_dist=lambda x: [pm.Normal.dist(0, 1), pm.Normal.dist(0, 1)]), "needs a regime"),
+    (
+        dict(process_dist=lambda x: [pm.Bernoulli.dist(0.5), pm.Laplace.dist(0, 1)]),
+        "needs normal noise beside",
+    ),
+    (
+        dict(
+            transition=lambda x, q: [q[0], q[1]],
+            process_dist=lambda x: [pm.Bernoulli.dist(0.5), pm.Bernoulli.dist(0.5)],
+            initial_dist=lambda: [0.0, 0.0],
+            inputs=(),
+        ),
+        "continuous states beside the regime",
+    ),
+    (
+        dict(process_dist=lambda x: [pm.DiscreteUniform.dist(0, 9), pm.Normal.dist(0, 1)]),
+        "at most 64 ways from regime to regime, this system has 100",
+    ),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), REFUSED, ids=lambda v: v if isinstance(v, str) else "")
+@pytest.mark.parametrize("filter", [psf.IMM(), psf.RBPF(10)], ids=str)
+def test_systems_that_are_refused(filter, changes, message):
+    system = switching(**changes)
+    with pytest.raises(ModelError, match=message):
+        psf.log_likelihood(system, filter, {}, OBSERVED, **RECORD)
+
+
+def test_probabilities_that_do_not_sum_to_one_are_a_failure():
+    bad = {"stay_0": 1.2, "stay_1": 0.5}
+    for filter in (psf.IMM(), psf.RBPF(10)):
+        with pytest.warns(FilterWarning):
+            terms = psf.log_likelihood(SYSTEM, filter, bad, OBSERVED, **RECORD)
+        assert np.isneginf(terms[1:]).any()
+
+
+@pytest.mark.parametrize("inner", [psf.BootstrapPF(10), psf.IMM(), psf.EKF, None], ids=str)
+def test_other_filters_inside(inner):
+    for make in (psf.IMM, lambda inner: psf.RBPF(10, inner=inner)):
+        with pytest.raises(ModelError, match=r"inner must be psf.EKF\(\), psf.UKF\(\) or"):
+            make(inner=inner)
+
+
+def test_settings_are_pickled():
+    for filter in (psf.IMM(inner=psf.UKF()), psf.RBPF(10, inner=psf.IPLF())):
+        assert pickle.loads(pickle.dumps(filter)) == filter

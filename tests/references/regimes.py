@@ -1,0 +1,74 @@
+"""Switching linear systems by enumeration: a Kalman filter for every path of the regimes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class SwitchingSystem:
+    """x' = A[r'] x + b[r'] + u + w, w ~ N(0, Q[r']), of the regime r' that a step leads to.
+
+    Regimes start with the probabilities ``start`` and change by ``P[r, r']``. All regimes have the
+    observation H x + e, e ~ N(0, R), and start from N(mean, cov).
+    """
+
+    P: np.ndarray
+    A: np.ndarray
+    b: np.ndarray
+    Q: np.ndarray
+    H: np.ndarray
+    R: np.ndarray
+    start: np.ndarray
+    mean: np.ndarray
+    cov: np.ndarray
+
+    def paths(self, steps, observed, inputs=None):
+        """For every path: its log-probability with the record, last regime, mean and covariance."""
+        before = [(np.log(p), (r,), self.mean, self.cov) for r, p in enumerate(self.start) if p]
+        k = 0
+        for step, d in zip(steps, np.reshape(observed, (len(steps), -1)), strict=True):
+            while k < step:
+                u = 0.0 if inputs is None else inputs[k]
+                before = [path for one in before for path in self._moved(*one, u)]
+                k += 1
+            before = [self._conditioned(*one, d) for one in before]
+        return before
+
+    def log_likelihood(self, steps, observed, inputs=None):
+        """The exact log-likelihood of a record."""
+        return np.logaddexp.reduce([path[0] for path in self.paths(steps, observed, inputs)])
+
+    def last_moments(self, steps, observed, inputs=None):
+        """Probabilities of the last regime, mean and covariance of the last state."""
+        paths = self.paths(steps, observed, inputs)
+        log_p = np.array([path[0] for path in paths])
+        w = np.exp(log_p - np.logaddexp.reduce(log_p))
+        regimes = np.array([path[1][-1] for path in paths])
+        means = np.array([path[2] for path in paths])
+        mean = w @ means
+        away = means - mean
+        cov = sum(p * path[3] for p, path in zip(w, paths, strict=True))
+        return (
+            np.array([w[regimes == r].sum() for r in range(len(self.start))]),
+            mean,
+            cov + (w[:, None] * away).T @ away,
+        )
+
+    def _moved(self, log_p, path, mean, cov, u):
+        for r, p in enumerate(self.P[path[-1]]):
+            if p:
+                A = self.A[r]
+                moved = A @ mean + self.b[r] + u
+                yield log_p + np.log(p), (*path, r), moved, A @ cov @ A.T + self.Q[r]
+
+    def _conditioned(self, log_p, path, mean, cov, d):
+        seen = ~np.isnan(d)
+        if not seen.any():
+            return log_p, path, mean, cov
+        H, R = self.H[seen], self.R[np.ix_(seen, seen)]
+        S = H @ cov @ H.T + R
+        gain = np.linalg.solve(S, H @ cov).T
+        away = d[seen] - H @ mean
+        log_p -= 0.5 * (away @ np.linalg.solve(S, away) + np.linalg.slogdet(2 * np.pi * S)[1])
+        return log_p, path, mean + gain @ away, cov - gain @ S @ gain.T
