@@ -45,6 +45,8 @@ GROUPS = {
         "IPLF",
         "FiniteStateFilter",
         "GridFilter",
+        "IMM",
+        "RBPF",
         "GuidedPF",
         "BootstrapPF",
         "EnKF",

@@ -14,6 +14,7 @@ from ..compiler.lowering.compiled_system import compile_system
 from ..errors import ModelError
 from ..filters.bootstrap import BootstrapPF
 from ..filters.protocol import Filter
+from ..filters.rbpf import RBPF
 from ..filters.recommendation import check_system_and_filter, short_form
 from ..progress import row_progress
 from ..pymc_model.density import compile_raveled
@@ -41,7 +42,9 @@ _MOST_DRAWS = 500  # of each chain, from which mean and spread are taken
 def _needs_check(system: Any, filter: Filter) -> bool:
     """Whether the likelihood of a filter may be off for reasons that its noise does not show."""
     compiled = compile_system(system)
-    if isinstance(filter, BootstrapPF):
+    if isinstance(filter, BootstrapPF) or (
+        isinstance(filter, RBPF) and filter.is_exact_for(compiled)
+    ):
         return False
     return not filter.is_exact_for(compiled) or (filter.noisy and not compiled.is_linear)
 
@@ -98,7 +101,7 @@ def check_model(
 
 def _plain_row(filter: Filter) -> Finding:
     name = short_form(filter)
-    if isinstance(filter, BootstrapPF):
+    if filter.noisy:
         verdict = f"{name} is unbiased; suggest_particles measures how much its estimates scatter"
     else:
         verdict = f"{name} is exact for this system"

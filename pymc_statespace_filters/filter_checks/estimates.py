@@ -17,6 +17,7 @@ from ..compiler.lowering.compiled_system import compile_system
 from ..filters.bootstrap import BootstrapPF
 from ..filters.guided_pf import GuidedPF
 from ..filters.protocol import Filter
+from ..filters.rbpf import RBPF
 from ..filters.recommendation import exact_filter, filters_for
 from ..pymc_model.filter_estimates import VariableAtPoints
 from ..pymc_model.inspection import resized
@@ -127,7 +128,7 @@ def compare(
     return Comparison(
         checked,
         next((one for one in others if not one.filter.noisy), None),
-        next((one for one in others if isinstance(one.filter, BootstrapPF)), None),
+        next((one for one in others if isinstance(one.filter, BootstrapPF | RBPF)), None),
         tuple(one for one in others if isinstance(one.filter, GuidedPF)),
     )
 
@@ -165,15 +166,18 @@ def is_unbiased(filter: Filter) -> bool:
 def _unbiased(variable: VariableAtPoints, filter: Filter, budget: Budget) -> list[Filter]:
     """Plain particles, and guided ones if there is time and no equation jumps, which misleads them.
 
-    Of a guided filter, the same with more particles.
+    Of a guided filter, the same with more particles. Plain are those with Kalman filters where they
+    are unbiased, which scatter far less.
     """
     system = compile_system(variable.system)
     n_points, n_steps = len(variable), variable.n_steps
     n_particles = budget.n_particles(N_SEEDS * n_points, n_steps, system.n)
     taken = filters_for(system)
-    found: list[Filter] = [
-        resized(one, n_particles) for one in taken if isinstance(one, BootstrapPF)
-    ]
+    regimes: list[Filter] = [one for one in taken if isinstance(one, RBPF) and one.is_exact_for(system)]
+    plain: list[Filter] = [one for one in taken if isinstance(one, BootstrapPF)]
+    if regimes and not isinstance(filter, RBPF):
+        plain = regimes
+    found: list[Filter] = [resized(one, n_particles) for one in plain]
     guided = [one for one in taken if isinstance(one, GuidedPF) and not system.jumping_equations]
     if isinstance(filter, GuidedPF):
         guided = [replace(filter, n_particles=_MORE * filter.n_particles)]

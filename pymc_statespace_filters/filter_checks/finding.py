@@ -7,6 +7,7 @@ import numpy as np
 
 from ..filters.bootstrap import BootstrapPF
 from ..filters.guided_pf import GuidedPF
+from ..filters.rbpf import RBPF
 from ..filters.recommendation import short_form
 from ..pymc_model.inspection import resized
 from .estimates import Comparison, Estimates
@@ -63,7 +64,7 @@ def cure(found: Comparison) -> str:
 
 def _enough(plain: Estimates) -> str:
     """Plain particles in a number that suits a chain."""
-    assert isinstance(plain.filter, BootstrapPF)
+    assert isinstance(plain.filter, BootstrapPF | RBPF)
     number = max(plain.filter.n_particles * plain.scatter**2 / _GOOD_VARIANCE, 100.0)
     digit = 10 ** math.floor(math.log10(number))
     return short_form(resized(plain.filter, digit * math.ceil(number / digit)))

@@ -1,6 +1,6 @@
-"""Interacting multiple model filter: a Gaussian filter for each regime of a system that switches."""
+"""Interacting multiple model filter: a Gaussian for each regime of a system that switches."""
 
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, field
 
 from ..compiler.lowering.compiled_system import compile_system
 from ..compiler.native.planned_function import PlannedFunction
@@ -73,7 +73,7 @@ class IMM(GaussianFilterBase):
     """
 
     _: KW_ONLY
-    inner: EKF | UKF | IPLF = EKF()
+    inner: EKF | UKF | IPLF = field(default=EKF())
 
     def __post_init__(self) -> None:
         check_inner(self.inner)

@@ -5,7 +5,7 @@ front of an observation, which tries all that may happen. See `regimes.particles
 """
 
 from collections.abc import Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -230,7 +230,7 @@ class RBPF(ParticleFilter):
     entry: ClassVar[EntryPoint] = likelihood_entry("rbpf", _evaluate, needs=(FILL_NORMALS,))
     _: KW_ONLY
     resample_below: float = 0.5
-    inner: EKF | UKF | IPLF = EKF()
+    inner: EKF | UKF | IPLF = field(default=EKF())
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -290,8 +290,8 @@ class RBPF(ParticleFilter):
         particles, size = self._particles(system), self.size()
         hybrid, order = particles.hybrid, self.ordering()
         if functions:
-            steps = (particles.condition, particles.move_to_observation)
-            others |= dict(zip(("condition", "move_to_observation"), (f.entry for f in steps)))
+            names = ("condition", "move_to_observation")
+            others |= {name: getattr(particles, name).entry for name in names}
         if order is not None:
             others["order"] = order
         sizes = (size, *self.noise_sizes(system), *self.settings())

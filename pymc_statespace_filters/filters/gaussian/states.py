@@ -83,6 +83,7 @@ def states_plan(
 
 @njit_internal
 def n_steps_of(table):
+    """The step of the last row of a record."""
     return table.rows[-1, 0] if table.rows.shape[0] else np.int64(0)
 
 

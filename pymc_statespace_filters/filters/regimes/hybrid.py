@@ -4,14 +4,13 @@ Given its regimes it is an ordinary system of the continuous states, see `given_
 regimes do is a list of moves, see `finite_states`, whose probabilities are here.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
 import pytensor.tensor as pt
-from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
@@ -19,7 +18,6 @@ from ...compiler.lowering.finite_states import FiniteStates, finite_states, star
 from ...compiler.lowering.given_regime import given_regime
 from ...compiler.lowering.structure import is_free_of, is_smooth_vector
 from ...compiler.lowering.symbols import SYMBOLS, call, jacobian_of, symbols_of
-from ...errors import ModelError
 from ...system.model import StateSpaceModel
 
 Symbols = Mapping[str, TensorVariable]
@@ -56,7 +54,7 @@ class Start(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Hybrid:
-    """A hybrid system, its finite states, and the system of the others given these.
+    """A hybrid system and its finite states, which make up the regime.
 
     Columns of inputs of the ``given`` system are those of the system, the regime, and the values v
     of the finite variables of a step.
@@ -64,7 +62,11 @@ class Hybrid:
 
     system: StateSpaceModel
     found: FiniteStates
-    given: StateSpaceModel
+
+    @cached_property
+    def given(self) -> StateSpaceModel:
+        """The system of the continuous states, given the others."""
+        return given_regime(self.system, self.found)
 
     @property
     def n(self) -> int:
@@ -107,9 +109,7 @@ class Hybrid:
         sizes = {name: symbol.type.shape for name, symbol in symbols_of(system).items()}
         state = {"x": self.whole(regime, x)}
         given = {name: values[name] for name in ("theta", "u", "t")} | state
-        (found,) = graph.bind(
-            [given.get(name, pt.zeros(sizes[name])) for name in SYMBOLS] + [v]
-        )
+        (found,) = graph.bind([given.get(name, pt.zeros(sizes[name])) for name in SYMBOLS] + [v])
         return Step(_law(found, system.n, v), found[list(self.found.indices)])
 
     def start(self, theta: TensorVariable, v: TensorVariable) -> Start:
@@ -167,8 +167,7 @@ class Hybrid:
 @lru_cache(maxsize=64)
 def hybrid_of(system: StateSpaceModel) -> Hybrid:
     """Divide a system into its regime and its continuous states."""
-    found = finite_states(system)
-    return Hybrid(system, found, given_regime(system, found))
+    return Hybrid(system, finite_states(system))
 
 
 _CERTAIN = Drawn(pt.ones((1,)), pt.ones((1,)))

@@ -105,11 +105,13 @@ class _Mixture:
 
     def _regimes(self, s: TensorVariable) -> list[Weighted]:
         """Probability and state of each regime."""
-        first, count, size = state_size(self.hybrid.system.n), len(self.hybrid.regimes), self.size_of_one
+        first, count, size = (
+            state_size(self.hybrid.system.n),
+            len(self.hybrid.regimes),
+            self.size_of_one,
+        )
         states = s[first + count :]
-        return [
-            Weighted(s[first + r], states[r * size : (r + 1) * size]) for r in range(count)
-        ]
+        return [Weighted(s[first + r], states[r * size : (r + 1) * size]) for r in range(count)]
 
     def _pack(self, parts: Sequence[Weighted]) -> TensorVariable:
         weights = pt.stack([part.weight for part in parts])
@@ -122,7 +124,9 @@ class _Mixture:
         for regime, part in zip(hybrid.regimes, parts, strict=True):
             mean, cov = unpack(part.state, hybrid.n)
             padded = pt.zeros((n, n))[n_finite:, n_finite:].set(cov)[order][:, order]
-            whole.append(Weighted(part.weight, pack(hybrid.whole(pt.constant(regime), mean), padded)))
+            whole.append(
+                Weighted(part.weight, pack(hybrid.whole(pt.constant(regime), mean), padded))
+            )
         return merged(whole, n).state
 
     def _start(self) -> list[Weighted]:
@@ -166,7 +170,7 @@ class _Mixture:
         return {self._given["s"]: state, self._given["u"]: row}
 
     def _collected(self, found: Mapping[int, Sequence[Weighted]]) -> list[Weighted]:
-        """Merge what arrives in each regime; one in which nothing arrives has a state of another."""
+        """Merge what arrives in each regime; where nothing does, the state is that of another."""
         some = next(iter(found.values()))[0]
         nothing = [Weighted(pt.zeros(()), some.state)]
         return [

@@ -1,4 +1,4 @@
-"""States of the filter of regimes: its moments, and draws of a regime and of the states given it."""
+"""States of the filter of merged regimes: its moments, and draws of regime and other states."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""States of a Rao-Blackwellised particle filter: moments and draws of the mixture of its particles."""
+"""States of a Rao-Blackwellised particle filter, the mixture of its particles."""
 
 import numpy as np
 from numba import carray
@@ -101,7 +101,11 @@ def _states(plan, record, request, results):
         return status
     to, n, n_rows = call.results, order.size, wanted_rows(call).size
     integers, cov = _header(call, order, n_finite), np.full(n_rows * n * n, np.nan)
-    integers[_MEAN], integers[_COV], integers[_DRAWN] = to[RESULTS.mean], cov.ctypes.data, to[RESULTS.drawn]
+    integers[_MEAN], integers[_COV], integers[_DRAWN] = (
+        to[RESULTS.mean],
+        cov.ctypes.data,
+        to[RESULTS.drawn],
+    )
     integers[_EFFECTIVE] = to[RESULTS.n_effective_wanted]
     mean, drawn = reals_at(to[RESULTS.mean], (n_rows, n)), reals_at(to[RESULTS.drawn], (n_rows, n))
     n_effective = reals_at(to[RESULTS.n_effective_wanted], (n_rows,))

@@ -6,7 +6,7 @@ joint values at which the cumulated probability exceeds that of the normal.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -21,6 +21,7 @@ from ...compiler.lowering.compiled_system import CompiledSystem, compile_system
 from ...compiler.lowering.symbols import SYMBOLS, symbols_of
 from ...system.model import StateSpaceModel
 from ...system.quantiles import normal_probability
+from ...system.tracing import Equations
 from ..gaussian.linearization import (
     Linearization,
     linearizations_of,
@@ -76,7 +77,10 @@ class HybridParticles:
         """The function of particles that are followed by a number in memory."""
         n = self.system.n
         longer, c = pt.tensor("x", shape=(n + 1,), dtype="float64"), self.system.constants
-        known = {equations.particle: longer[:n], equations.values["theta"]: c[: self.system.n_theta]}
+        known = {
+            equations.particle: longer[:n],
+            equations.values["theta"]: c[: self.system.n_theta],
+        }
         (outputs,) = graph_replace([outputs], known, strict=False)
         given = {name: equations.values[name] for name in inputs}
         graph = Graph({"theta": c, "x": longer, **given, **others}, [outputs])
@@ -181,8 +185,8 @@ class _Equations:
     def system(self) -> StateSpaceModel:
         """A system whose state is a particle."""
         model, n = self.hybrid.system, self.n
-        symbols = {**self.values, "x": self.particle, "q": self.z, "e": pt.dvector("e")}
-        symbols["e"] = pt.tensor("e", shape=(0,), dtype="float64")
+        no_noise = pt.tensor("e", shape=(0,), dtype="float64")
+        symbols = {**self.values, "x": self.particle, "q": self.z, "e": no_noise}
         _, term = self.updated(self.values, *self.parts(self.particle))
         inputs = [symbols[name] for name in SYMBOLS]
 
@@ -190,15 +194,14 @@ class _Equations:
             return FrozenFunctionGraph.from_io(inputs, [output])
 
         columns = tuple(f"column {i}" for i in range(model.n_input_columns))
-        nothing = dict.fromkeys(
-            "gaussian_transition process_noise observation observation_noise observation_draw "
-            "finite_step finite_start".split()
-        )
         start = FrozenFunctionGraph.from_io([self.values["theta"], self.z], [self.start()])
-        equations = replace(
-            model.equations,
-            **nothing,
+        equations = Equations(
             transition=frozen(self.step()),
+            gaussian_transition=None,
+            process_noise=None,
+            observation=None,
+            observation_noise=None,
+            observation_draw=None,
             observation_logp=frozen(pt.atleast_1d(term)),
             initial_mean=frozen(pt.zeros((n,))),
             initial_cov=frozen(pt.zeros((n, n))),
