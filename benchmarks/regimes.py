@@ -1,11 +1,11 @@
 """Noise and time of filters of a switching oscillator, with a coarse and with a precise sensor.
 
-The damping of a linear oscillator switches, some five times along a record of 400 steps with an
+The damping of a linear oscillator switches, some eight times along a record of 400 steps with an
 observation after every fourth. Numbers are of the log-likelihood at the true parameters, in nats:
 its mean over seeds minus the exact one, its standard deviation, CPU milliseconds of an evaluation,
-and variance times time relative to ``BootstrapPF(1000)``. Exact is the log of the mean likelihood of
-``RBPF(20_000)``, which is unbiased. Run it with ``python -m benchmarks.regimes`` from the root of the
-repository; it takes a minute.
+and variance times time relative to ``BootstrapPF(1000)``. Exact is the log of the mean likelihood
+of ``RBPF(20_000)``, which is unbiased. Run it with ``python -m benchmarks.regimes`` from the root
+of the repository; it takes a minute.
 """
 
 import time

@@ -173,7 +173,9 @@ def _unbiased(variable: VariableAtPoints, filter: Filter, budget: Budget) -> lis
     n_points, n_steps = len(variable), variable.n_steps
     n_particles = budget.n_particles(N_SEEDS * n_points, n_steps, system.n)
     taken = filters_for(system)
-    regimes: list[Filter] = [one for one in taken if isinstance(one, RBPF) and one.is_exact_for(system)]
+    regimes: list[Filter] = [
+        one for one in taken if isinstance(one, RBPF) and one.is_exact_for(system)
+    ]
     plain: list[Filter] = [one for one in taken if isinstance(one, BootstrapPF)]
     if regimes and not isinstance(filter, RBPF):
         plain = regimes

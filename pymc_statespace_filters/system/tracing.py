@@ -272,6 +272,7 @@ def trace(
         initial_cov=freeze(inputs, [initial_cov], "initial_cov"),
         initial_draw=start.freeze_draw(theta),
         finite_start=start.freeze_given_values(theta),
+        others_are_gaussian=start.given is None or start.given.others_are_gaussian,
     )
     return _with_finite_step(equations, functions, symbols, inputs, begin), seen
 
@@ -293,7 +294,8 @@ def _with_finite_step(
         pt.concatenate([step, given.law]), {symbols.values["x"]: begin}, strict=False
     )
     graph = freeze([*inputs, given.values], [both], "process_dist")
-    return replace(equations, finite_step=graph, others_are_gaussian=given.others_are_gaussian)
+    others_are_gaussian = equations.others_are_gaussian and given.others_are_gaussian
+    return replace(equations, finite_step=graph, others_are_gaussian=others_are_gaussian)
 
 
 def _of_length(functions: Functions, symbols: Symbols) -> Functions:

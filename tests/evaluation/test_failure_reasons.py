@@ -183,4 +183,4 @@ def test_a_filter_is_recommended_where_it_has_a_likelihood():
 def test_every_failure_of_a_filter_has_a_sentence():
     assert len({failure.message for failure in Failure}) == len(Failure)
     assert all(f.message and not f.message.endswith(".") for f in Failure)
-    assert len(FILTERS) == len(ALL)
+    assert {type(f) for f in FILTERS if takes(system(), f)} == {type(f) for f in ALL}

@@ -64,6 +64,15 @@ SYSTEMS = {
         system(transition=lambda x: pt.sin(x[0]), process_noise=...),
         PARTICLES | GAUSSIAN | {"EnKF"},
     ),
+    "regimes": (
+        system(
+            transition=lambda x, q: [0.9 * x[0] + q[0] + q[1], q[0]], process_noise=...,
+            process_dist=lambda x: [pm.Bernoulli.dist(0.2 + 0.6 * x[1]), pm.Normal.dist(0.0, 1.0)],
+            states=["z", "regime"], carried=["regime"], initial_mean=[0.0, 0.0],
+            initial_cov=np.diag([1.0, 0.0]),
+        ),
+        {"BootstrapPF", "IMM", "RBPF"},
+    ),
 }  # fmt: skip
 
 

@@ -235,8 +235,8 @@ def test_probabilities_that_depend_on_the_state():
     assert not psf.RBPF(10).is_exact_for(compiled)
     assert not psf.IMM().is_exact_for(compiled)
     plain = log_likelihood(psf.BootstrapPF(20_000), system, {}, seed=np.arange(4)).mean()
-    assert log_likelihood(psf.IMM(), system, {}) == pytest.approx(plain, abs=0.15)
-    assert log_likelihood(psf.RBPF(2000), system, {}) == pytest.approx(plain, abs=0.15)
+    assert log_likelihood(psf.IMM(), system, {}) == pytest.approx(plain, abs=0.25)
+    assert log_likelihood(psf.RBPF(2000), system, {}) == pytest.approx(plain, abs=0.25)
 
 
 def test_held_noise_is_the_noise_of_its_seed():
@@ -290,6 +290,10 @@ REFUSED = [
             inputs=(),
         ),
         "continuous states beside the regime",
+    ),
+    (
+        dict(initial_dist=lambda: [pm.Gamma.dist(2, 1), pm.Bernoulli.dist(0.5)]),
+        "another distribution in process_dist or initial_dist",
     ),
     (
         dict(process_dist=lambda x: [pm.DiscreteUniform.dist(0, 9), pm.Normal.dist(0, 1)]),
