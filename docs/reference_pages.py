@@ -63,6 +63,8 @@ GROUPS = {
         "StateSpace",
         "sample",
         "sample_dram",
+        "sample_smc",
+        "extend",
         "RandomWalkSettings",
         "Ranks",
         "DRAM",

@@ -30,6 +30,7 @@ from .filters import (
     GuidedPF,
     PFEnKF,
 )
+from .parameter_particles import extend, sample_smc
 from .plots import (
     plot_average,
     plot_evidence,
@@ -106,6 +107,7 @@ __all__ = [
     "drifting",
     "errors",
     "estimate_evidence",
+    "extend",
     "filter_diagnostics",
     "filtered_states",
     "find_starts",
@@ -133,6 +135,7 @@ __all__ = [
     "run_models",
     "sample",
     "sample_dram",
+    "sample_smc",
     "simulate",
     "smoothed_states",
     "stationary",

@@ -230,6 +230,29 @@ def row_progress(
         yield bar.begin if enabled else lambda task, total: None
 
 
+@contextmanager
+def stage_progress(total: float, *, enabled: bool) -> Iterator[Callable[[float, str], None]]:
+    """Show the stages of work that takes longer than `PATIENCE`.
+
+    Yields the function that says how much of the total is done, and what the last stage was.
+    """
+    start, shown = perf_counter(), None
+    with ExitStack() as stack:
+
+        def show(done: float, text: str) -> None:
+            nonlocal shown
+            if not enabled or perf_counter() - start < PATIENCE:
+                return
+            if shown is None:
+                bar = stack.enter_context(create_simple_progress())
+                stack.enter_context(_quiet_compilation())
+                shown = bar, bar.add_task(text, total=total)
+            bar, row = shown
+            bar.update(row, description=text, completed=done)
+
+        yield show
+
+
 _shown: list[object] = []  # bars, and lines that may be
 
 

@@ -5,7 +5,7 @@ Log-densities on the unconstrained space include the Jacobians of the transforms
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple, Protocol
@@ -264,7 +264,7 @@ def _stored_log_density(
     )
 
 
-class _Observed(NamedTuple):
+class Observed(NamedTuple):
     """Observed values of a variable, and whether an observation is a vector (the last axis).
 
     The first ``score_from`` rows, of each record in a panel, have no term in the log-density;
@@ -283,7 +283,7 @@ class _Observed(NamedTuple):
         return self.values[self.is_scored]
 
 
-def _observed(model: pm.Model) -> list[_Observed]:
+def observed_in(model: pm.Model) -> list[Observed]:
     """What every observed variable has for data."""
     found = []
     for rv in model.observed_RVs:
@@ -291,7 +291,7 @@ def _observed(model: pm.Model) -> list[_Observed]:
         op = rv.owner.op
         is_vector, score_from = getattr(op, "ndim_supp", 0) > 0, getattr(op, "score_from", 0)
         records = _records(rv.owner, values)
-        found.append(_Observed(values, records, is_vector, score_from, scored_rows(rv.owner)))
+        found.append(Observed(values, records, is_vector, score_from, scored_rows(rv.owner)))
     return found
 
 
@@ -308,15 +308,20 @@ def observation_count(model: pm.Model) -> int:
     A vector-valued observation (a row of a state-space or multivariate variable) counts once, like
     a scalar one; the counts of several observed variables are added.
     """
+    return count_of(observed_in(model))
+
+
+def count_of(observed: Sequence[Observed]) -> int:
+    """Count the observations of some variables, as `observation_count`."""
     return sum(
         int((~np.isnan(one.scored).all(axis=-1) if one.is_vector else ~np.isnan(one.scored)).sum())
-        for one in _observed(model)
+        for one in observed
     )
 
 
 def scalar_count(model: pm.Model) -> int:
     """Count the observed scalars of a model that are scored and not missing."""
-    return sum(int((~np.isnan(one.scored)).sum()) for one in _observed(model))
+    return sum(int((~np.isnan(one.scored)).sum()) for one in observed_in(model))
 
 
 def data_fingerprint(model: pm.Model) -> str:
@@ -331,8 +336,13 @@ def data_fingerprint(model: pm.Model) -> str:
         their order nor their labels matter. Axes of length one are ignored, so that a vector of J
         values equals a table of one column.
     """
+    return fingerprint_of(observed_in(model))
+
+
+def fingerprint_of(observed: Sequence[Observed]) -> str:
+    """Hash the values of some variables, as `data_fingerprint`."""
     hashes = []
-    for one in _observed(model):
+    for one in observed:
         unscored = f" scored from {one.score_from}" if one.score_from else ""
         for values in map(np.squeeze, one.records):
             canonical = np.where(np.isnan(values), np.nan, values + 0.0)  # one NaN, one zero

@@ -196,6 +196,10 @@ class ModelFactors:
         A noisy likelihood is estimated with fresh noise at every point.
         """
         seeds = rng.integers(np.iinfo(np.int64).max, size=(len(x), len(self.density.seed_names)))
+        return self.evaluate_with(x, seeds)
+
+    def evaluate_with(self, x: Array, seeds: NDArray[np.int64]) -> tuple[Array, Array]:
+        """The same with the noise of these seeds, a row for each point."""
         log_prior = self.prior.log_density(x)
         with np.errstate(invalid="ignore"):
             log_likelihood = self.density.evaluate(x, seeds) - log_prior

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 import pytensor
@@ -15,7 +16,7 @@ from ...parallel.cpu_affinity import available_cores
 from ...parallel.signals import held_interrupts
 from ...parallel.threads import run_in_threads
 from .entry_point import njit_cached
-from .pytensor_function import NativeFunction, make_call
+from .pytensor_function import Call, make_call
 
 # Control block of each thread: rows done, written by the thread; stop, written by the main thread.
 _N_DONE, _STOP = 0, 1
@@ -37,6 +38,26 @@ def _call_rows(call, argument, rows, results, control):
     return True
 
 
+class RowFunction(Protocol):
+    """What is evaluated at rows: a `NativeFunction`, or a `planned_rows.PlannedRow`."""
+
+    is_native: bool
+    example: list[np.ndarray]
+    kinds: list[tuple[tuple[int, ...], np.dtype]]
+
+    @property
+    def size(self) -> int:
+        """Total number of elements of the results."""
+
+    def __call__(self, *inputs: np.ndarray) -> Sequence[np.ndarray]:
+        """Call from Python."""
+        ...
+
+    def bind(self, inputs: Sequence[np.ndarray]) -> tuple[Call, Callable[[], object]]:
+        """A call that reads these arrays, and a function that repeats it from Python."""
+        ...
+
+
 class Rows:
     """A function whose first ``n_varying`` arguments, float64 or int64, differ from row to row.
 
@@ -47,7 +68,7 @@ class Rows:
     of rows done since its last call.
     """
 
-    def __init__(self, function: NativeFunction, n_varying: int, *, in_turn: bool = False) -> None:
+    def __init__(self, function: RowFunction, n_varying: int, *, in_turn: bool = False) -> None:
         self._function, self._in_turn = function, in_turn or not function.is_native
         self._varying = function.example[:n_varying]
         self._constant = function.example[n_varying:]

@@ -50,9 +50,9 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from ...errors import ModelError
+from ...smc.temperature import next_temperature
 from ...student_mixture import StudentMixture
 from ...system.checks import check_count, is_integer
-from ...tempering import next_temperature
 from ..posterior import Posterior
 from .populations import compare_with_draws
 from .protocol import Estimate

@@ -27,8 +27,8 @@ from scipy.special import logsumexp
 
 from ...errors import ModelError
 from ...importance import normalised, systematic
+from ...smc.temperature import next_temperature
 from ...student_mixture import StudentMixture, fit_mixture, place_components, standardised
-from ...tempering import next_temperature
 from ..posterior import Posterior
 
 SCALE = 3.0  # of the wide part, in widths of the fit to the draws

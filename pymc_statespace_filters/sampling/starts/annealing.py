@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...tempering import next_temperature
+from ...smc.temperature import next_temperature
 
 _ESS_FRACTION = 0.5  # left by a step of the temperature
 _MOVES = 3  # at each temperature

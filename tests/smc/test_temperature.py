@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pymc_statespace_filters.tempering import next_temperature
+from pymc_statespace_filters.smc.temperature import next_temperature
 
 
 @pytest.mark.parametrize("share", [0.5, 0.85])

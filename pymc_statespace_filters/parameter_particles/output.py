@@ -1,0 +1,157 @@
+"""A run as a DataTree: equally likely draws, their errors, the course of the run, the evidence.
+
+The draws of the posterior are particles of all populations, resampled in proportion to weight and
+evidence and kept in their order, so that a chain of the result is nearly a population. All that
+takes draws of a posterior takes these.
+"""
+
+import warnings
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+from numpy.typing import NDArray
+
+from ..errors import EvidenceWarning
+from ..evidence.evidence import Evidence, store_evidence
+from ..evidence.posterior import Observed, count_of, fingerprint_of
+from ..importance import normalised
+from ..pymc_model.inspection import exactness, filters_used, noise_seeds
+from ..pymc_model.prior import Support
+from ..sampling.output.datatree import to_datatree
+from ..sampling.output.deterministics import Deterministics
+from ..sampling.target.variables import RaveledVariables
+from ..smc.merging import mean_and_error, merged_index, merged_log_evidence
+from ..smc.particles import Particles
+from .request import Request, Run
+
+ESTIMATOR = "smc"
+COURSE, ERRORS = "smc", "mcse"
+MAX_SPREAD = 0.7  # relative, of the evidences of the populations
+MIN_ACCEPTANCE = 0.02
+_DRAWS = 2**32  # key of random numbers beside those of the run
+
+Array = NDArray[np.float64]
+
+
+def as_datatree(
+    model: pm.Model,
+    run: Run,
+    request: Request,
+    observed: Sequence[Observed],
+    *,
+    data: str,
+    seconds: float,
+    maximum: float,
+) -> xr.DataTree:
+    """The result of a run of a model with the data ``observed``.
+
+    ``maximum`` is the largest log-likelihood found, of the evidence; ``data`` is the way in which
+    the data came in.
+
+    Warns
+    -----
+    EvidenceWarning
+        If the populations disagree, or moves are rarely accepted.
+    """
+    particles = run.cloud.others.particles
+    index = merged_index(
+        run.cloud.others,
+        run.log_evidences,
+        request.n_populations * request.draws,
+        request.generator(_DRAWS),
+    )
+    raveled = RaveledVariables(model.value_vars, model.initial_point())
+    chains = _chains(model, particles.at(index), index // request.size.n_particles, request)
+    tree = to_datatree(
+        model, raveled, chains, tune=0, keep_warmup=False, sampling_time=seconds,
+        attrs={"sampler": ESTIMATOR},
+    )  # fmt: skip
+    merged, error = map(float, merged_log_evidence(run.log_evidences))
+    tree[COURSE] = xr.DataTree(run.course.assign(log_evidence=("population", run.log_evidences)))
+    tree[ERRORS] = xr.DataTree(_errors(tree, Deterministics(model, raveled)(particles.x), run))
+    tree.attrs |= {
+        **filters_used(model),
+        "exact": int(exactness(model)),
+        "sampler": ESTIMATOR,
+        "data": data,
+        "log_evidence": merged,
+        "log_evidence_se": error,
+    }
+    evidence = _evidence(model, merged, error, run, observed, maximum)
+    store_evidence(tree, evidence, {"n_populations": float(request.n_populations)})
+    if evidence.doubts:
+        warnings.warn(
+            f"the log-evidence {merged:.2f} is less certain than its standard error suggests: "
+            f"{evidence.doubts}",
+            EvidenceWarning,
+            stacklevel=4,
+        )
+    return tree
+
+
+def _chains(
+    model: pm.Model, draws: Particles, population: NDArray[np.int64], request: Request
+) -> list[tuple[Array, dict[str, np.ndarray]]]:
+    """Positions and statistics of the draws, as many in each chain."""
+    stats = {"lp": draws.log_density(1.0), "population": population}
+    for column, name in enumerate(noise_seeds(model)):
+        stats[f"{name}_seed"] = draws.seeds[:, column]
+    parts = [
+        slice(i * request.draws, (i + 1) * request.draws) for i in range(request.n_populations)
+    ]
+    return [(draws.x[part], {n: values[part] for n, values in stats.items()}) for part in parts]
+
+
+def _errors(tree: xr.DataTree, values: dict[str, np.ndarray], run: Run) -> xr.Dataset:
+    """The Monte Carlo standard error of the mean of each variable of the posterior."""
+    found = {}
+    for name, of_particles in values.items():
+        mean = tree["posterior"].to_dataset()[name].mean(("chain", "draw"))  # for its coordinates
+        error = mean_and_error(of_particles, run.cloud.others, run.log_evidences)[1]
+        found[name] = mean.copy(data=error)
+    return xr.Dataset(found)
+
+
+def _evidence(
+    model: pm.Model,
+    value: float,
+    error: float,
+    run: Run,
+    observed: Sequence[Observed],
+    maximum: float,
+) -> Evidence:
+    support = Support.of(model)
+    return Evidence(
+        value,
+        error,
+        ESTIMATOR,
+        n_parameters=run.cloud.others.particles.x.shape[1],
+        n_observations=count_of(observed),
+        max_log_likelihood=maximum,
+        data_fingerprint=fingerprint_of(observed),
+        noise="refreshed" if noise_seeds(model) else "none",
+        doubts="; ".join([*support.check(), *_doubts(run)]),
+        log_volume=support.log_volume,
+        uniform=support.uniform,
+        improper=support.improper,
+        approximate=not exactness(model),
+    )
+
+
+def _doubts(run: Run) -> Iterator[str]:
+    """What says that the spread of the populations is no measure of the error."""
+    shares = normalised(run.log_evidences)
+    spread = float(shares.std(ddof=1) / shares.mean())
+    if spread > MAX_SPREAD:
+        yield (
+            f"the evidences of the populations have a standard deviation of {spread:.2f} of their "
+            "mean, so that a few of them decide: raise draws, or narrow the priors"
+        )
+    least = float(np.nanmin(run.course["acceptance"].values, initial=1.0))
+    if least < MIN_ACCEPTANCE:
+        yield (
+            f"moves are rarely accepted ({least:.1%} at worst): reduce the noise of the likelihood "
+            "(more particles of the filter), or raise draws"
+        )

@@ -1,0 +1,84 @@
+"""The arguments of a run, checked, and what all runs have in common."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+from numpy.typing import NDArray
+
+from ..errors import ModelError
+from ..filters.outcomes import why_zero
+from ..pymc_model.density import check_free_variables
+from ..pymc_model.filter_estimates import failures_at
+from ..smc.bridge import Cloud
+from ..smc.moves import Size
+from ..smc.particles import Particles, Populations
+from ..system.checks import check_count, check_flag
+
+N_EXPLAINED = 100  # prior draws that are evaluated once more to say why their likelihood is zero
+
+
+class Request(NamedTuple):
+    """How many particles and populations, how they are moved, and the key of all random numbers."""
+
+    draws: int
+    size: Size
+    n_populations: int
+    entropy: tuple[int, ...]
+
+    @property
+    def n_particles(self) -> int:
+        """Particles of all populations, the pilot included."""
+        return self.size.n_particles * (1 + self.n_populations)
+
+    def generator(self, *key: int) -> np.random.Generator:
+        """The random numbers of a part of the run."""
+        return np.random.default_rng([*self.entropy, *key])
+
+    def cloud(self, particles: Particles) -> Cloud:
+        """Divide particles into the pilot and the other populations."""
+        of_pilot = np.arange(len(particles.x)) < self.size.n_particles
+        pilot, others = particles.at(of_pilot), particles.at(~of_pilot)
+        return Cloud(
+            Populations.of_equal_weights(pilot, 1),
+            Populations.of_equal_weights(others, self.n_populations),
+        )
+
+
+class Run(NamedTuple):
+    """What a run has led to: the particles, the evidence by each population, and its course."""
+
+    cloud: Cloud
+    log_evidences: NDArray[np.float64]  # (R,)
+    course: xr.Dataset
+
+
+def checked_request(
+    model: pm.Model, draws: int, populations: int, waste_free: bool, entropy: tuple[int, ...]
+) -> Request:
+    """Check the arguments against the model."""
+    check_free_variables(model)
+    start = model.initial_point()
+    k = sum(start[model.rvs_to_values[rv].name].size for rv in model.free_RVs)
+    check_count("draws", draws, 1)
+    if draws < 2 * k:
+        raise ModelError(
+            f"draws must be at least twice the number of parameters, {2 * k}, got {draws}"
+        )
+    check_count("populations", populations, 2)
+    size = Size.of(int(draws), check_flag("waste_free", waste_free))
+    return Request(int(draws), size, int(populations), entropy)
+
+
+def check_alive(model: pm.Model, cloud: Cloud) -> None:
+    """Raise if too few particles of the pilot have a positive likelihood."""
+    particles = cloud.pilot.particles
+    alive = np.isfinite(particles.log_density(1.0))
+    least = 2 * particles.x.shape[1] + 2
+    if alive.sum() < least:
+        dead = particles.x[~alive][:N_EXPLAINED]
+        raise ModelError(
+            f"the likelihood is positive at {alive.sum()} of {alive.size} draws of the prior, fewer"
+            f" than {least}: {why_zero(failures_at(model, dead), len(dead))}, or raise draws"
+        )

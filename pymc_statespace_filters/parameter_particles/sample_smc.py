@@ -1,0 +1,182 @@
+"""`sample_smc`: a posterior by particles of the parameters, with its evidence."""
+
+from time import perf_counter
+from typing import Literal
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+
+from ..compiler.native.compilation import COMPILATION
+from ..errors import ModelError
+from ..evidence.estimators.maximum_likelihood import max_log_likelihood
+from ..evidence.posterior import Posterior, observed_in
+from ..progress import stage_progress
+from ..pymc_model.inspection import given_model
+from ..pymc_model.prior import ModelFactors
+from ..system.checks import check_flag, check_random_seed
+from .observed_rows import ObservedRows
+from .output import as_datatree
+from .request import Request, Run, checked_request
+from .sequential_output import finished
+from .sequential_run import Progress
+from .whole_data import tempered_run
+
+_MAXIMUM = 2**32 + 1  # key of random numbers beside those of the run
+
+
+def sample_smc(
+    draws: int = 1000,
+    *,
+    model: pm.Model | None = None,
+    data: Literal["tempered", "sequential"] = "tempered",
+    populations: int = 10,
+    waste_free: bool = True,
+    random_seed: int | np.random.Generator | None = None,
+    progressbar: bool = True,
+) -> xr.DataTree:
+    r"""Draw from a posterior by sequential Monte Carlo over its parameters, with the evidence.
+
+    Several populations of weighted parameters, the particles, are led from the prior to the
+    posterior; where few of them carry the weight, they are resampled and moved by Metropolis steps.
+
+    Parameters
+    ----------
+    draws : int
+        Particles in each population, at least twice as many as there are parameters.
+    model : pymc.Model, optional
+        With continuous free variables and a prior that can be drawn from; by default that of the
+        ``with`` block.
+    data : {"tempered", "sequential"}
+        How the data come in. "tempered": all at once, the likelihood raised to powers that grow
+        from 0 to 1; any model. "sequential": row by row, for a model whose data are one record of a
+        `StateSpace` variable, with a filter whose state can go on: `EKF`, `UKF`, `IPLF`,
+        `BootstrapPF`, `EnKF` or `PFEnKF`. Each particle keeps its filter, so that a row costs one
+        update of each; only moves filter the rows so far again. `extend` adds rows later.
+    populations : int
+        Populations, at least 2, whose spread gives the errors. One more, the pilot, chooses
+        temperatures and steps, and is not part of the result.
+    waste_free : bool
+        Whether all states of few long chains are the particles after a move (Dau and Chopin), or
+        the last states of as many short chains as there are particles.
+    random_seed : int or numpy.random.Generator, optional
+        Seed, of which the result is a function, on any number of threads.
+    progressbar : bool
+        Whether to show the stage, its effective size and acceptance, after two seconds.
+
+    Returns
+    -------
+    xarray.DataTree
+        ``posterior`` and ``sample_stats`` (chain, draw), equally likely draws: particles of all
+        populations, in proportion to weight and to the evidence that their population has found, in
+        the order of their chains. A chain is nearly a population; ``sample_stats["population"]`` is
+        the exact one, beside ``lp`` and, for a noisy variable "d", ``d_seed``. ``mcse`` has the
+        Monte Carlo standard error of every posterior mean, from the spread of the populations:
+        effective sample sizes of ArviZ do not hold for particles. ``smc`` has the course of the
+        run: of "tempered" for each ``stage`` the ``temperature``, ``effective_size`` (population,
+        stage), ``acceptance``, number ``n_steps`` and relative length ``scale`` of the moves; of
+        "sequential" for each ``row`` the ``score``, log p(d_j | d_1 .. d_{j-1}) with the parameters
+        integrated out, ``score_se``, ``effective_size``, the number ``n_stages`` of moves,
+        ``acceptance``, ``n_members`` of the filter, ``variance`` of the log-likelihood where it was
+        measured, and ``n_updates`` of filters. ``evidence`` holds the evidence, as
+        `estimate_evidence` stores it, with the estimator "smc"; the attributes ``log_evidence`` and
+        ``log_evidence_se`` repeat it. ``smc_state``, of "sequential", is what `extend` goes on
+        from.
+
+    Raises
+    ------
+    ModelError
+        If an argument is invalid, a free variable is discrete, the prior cannot be drawn from, the
+        likelihood is zero at nearly all its draws, or the data of "sequential" do not come row by
+        row: several variables, a panel, a Potential, a `GuidedPF` or `GridFilter`.
+
+    Warns
+    -----
+    EvidenceWarning
+        If the evidences of the populations differ so much that a few decide, if moves are rarely
+        accepted, or if a prior is not normalised.
+
+    See Also
+    --------
+    extend : More rows for a sequential run.
+    sample : Chains, which take fewer evaluations for one posterior.
+    estimate_evidence : The evidence from draws of any sampler.
+    plot_prequential : Which rows speak for which model.
+
+    Notes
+    -----
+    The product of the mean weights of a population is an unbiased estimate of the evidence, since
+    the pilot alone decides when and how the others are moved. The evidences are averaged, and their
+    standard error is wider by the ratio of Student's to the normal 95 % interval.
+
+    A noisy likelihood is estimated when a point is proposed, and the estimate stays with its point:
+    with an unbiased filter the posterior and the evidence are exact for any number of its members.
+    `EnKF` and `PFEnKF` have a bias, which the results carry (``attrs["exact"]`` is 0). After moves
+    of a sequential run the variance of the log-likelihood at fixed parameters is measured; above 2
+    the members are doubled, the ratio of new to old estimates being a factor of the weights.
+    ``attrs["filter"]`` is the filter at the end. A sequential run with a noisy filter has no
+    ``max_log_likelihood``, NaN.
+
+    References
+    ----------
+    H.-D. Dau and N. Chopin (2022). Waste-free sequential Monte Carlo. J. R. Stat. Soc. B 84,
+    114-148. N. Chopin (2002). A sequential particle filter method for static models. Biometrika 89,
+    539-551. N. Chopin, P. E. Jacob and O. Papaspiliopoulos (2013). SMC^2. J. R. Stat. Soc. B 75,
+    397-426.
+
+    Examples
+    --------
+    >>> import pymc as pm
+    >>> import pymc_statespace_filters as psf
+    >>> with pm.Model():
+    ...     mu = pm.Normal("mu", 0, 2)
+    ...     _ = pm.Normal("y", mu, 1, observed=[0.3, -0.4, 1.1])
+    ...     idata = psf.sample_smc(200, random_seed=2, progressbar=False)
+    >>> exact, found, error = -4.6154, idata.attrs["log_evidence"], idata.attrs["log_evidence_se"]
+    >>> abs(found - exact) < 4 * error < 0.4
+    True
+    """
+    model = given_model(model)
+    if not (isinstance(data, str) and data in ("tempered", "sequential")):
+        raise ModelError(f"data must be 'tempered' or 'sequential', got {data!r}")
+    rng = check_random_seed(random_seed)
+    entropy = tuple(rng.integers(2**63, size=2).tolist())
+    request = checked_request(model, draws, populations, waste_free, entropy)
+    with COMPILATION:
+        run = _tempered if data == "tempered" else _sequential
+        return run(model, request, check_flag("progressbar", progressbar))
+
+
+def _tempered(model: pm.Model, request: Request, progressbar: bool) -> xr.DataTree:
+    began = perf_counter()
+    with stage_progress(1.0, enabled=progressbar) as show:
+        run = tempered_run(model, request, show)
+        maximum = _maximum(model, run, request)
+    seconds = perf_counter() - began
+    observed = observed_in(model)
+    return as_datatree(
+        model, run, request, observed, data="tempered", seconds=seconds, maximum=maximum
+    )
+
+
+def _sequential(model: pm.Model, request: Request, progressbar: bool) -> xr.DataTree:
+    rows = ObservedRows.of(model)
+    return finished(Progress.before_any_row(rows, request), request, progressbar=progressbar)
+
+
+def _maximum(model: pm.Model, run: Run, request: Request) -> float:
+    """The largest log-likelihood found by a search from the particles."""
+    factors = ModelFactors(model)
+    particles, shape = run.cloud.others.particles, run.cloud.others.log_weights.shape
+
+    def evaluate(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        return np.add(*factors.evaluate(x, rng))
+
+    posterior = Posterior(
+        particles.x.reshape(*shape, -1),
+        particles.log_density(1.0).reshape(shape),
+        evaluate,
+        factors.is_noisy,
+        factors.prior,
+    )
+    return max_log_likelihood(posterior, request.generator(_MAXIMUM)).log_likelihood

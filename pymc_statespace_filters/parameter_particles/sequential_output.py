@@ -1,0 +1,52 @@
+"""A sequential run led to the end of its record, and its DataTree."""
+
+import json
+from time import perf_counter
+
+import numpy as np
+import xarray as xr
+
+from ..evidence.posterior import Observed
+from ..filters.recommendation import short_form
+from ..progress import stage_progress
+from .observed_rows import ObservedRows
+from .output import COURSE, as_datatree
+from .request import Request
+from .sequential_run import Progress, advance
+from .stored_run import GROUP, stored
+
+
+def finished(progress: Progress, request: Request, *, progressbar: bool) -> xr.DataTree:
+    """The result of a run that is led through all rows of its record."""
+    began, n_rows = perf_counter(), len(progress.rows.record.steps)
+    with stage_progress(n_rows, enabled=progressbar) as show:
+        progress = advance(progress, request, show)
+    rows, run = progress.rows, progress.as_run()
+    likelihood = run.cloud.others.particles.log_likelihood
+    tree = as_datatree(
+        rows.model,
+        run,
+        request,
+        [_observed(rows)],
+        data="sequential",
+        seconds=perf_counter() - began,
+        # With noise the largest of many estimates says nothing of the maximum.
+        maximum=np.nan if rows.filter.noisy else float(likelihood.max()),
+    )
+    name, dims = rows.variable.name, rows.variable.dims
+    # The filter may have more members than that of the model, and the record more rows.
+    tree.attrs["filter"] = json.dumps({name: short_form(rows.filter)})
+    data = tree["observed_data"].to_dataset().drop_dims(dims[0], errors="ignore")
+    coords = {dims[0]: rows.shown_times, dims[1]: list(rows.variable.system.observables)}
+    array = xr.DataArray(rows.record.observed, coords, dims)
+    tree["observed_data"] = xr.DataTree(data.assign({name: array}))
+    course = tree[COURSE].to_dataset().assign_coords(row=rows.shown_times)
+    tree[COURSE] = xr.DataTree(course)
+    if (state := stored(progress, request)) is not None:
+        tree[GROUP] = xr.DataTree(state)
+    return tree
+
+
+def _observed(rows: ObservedRows) -> Observed:
+    values, score_from = rows.record.observed, rows.variable.score_from
+    return Observed(values, [values], True, score_from, slice(score_from, None))

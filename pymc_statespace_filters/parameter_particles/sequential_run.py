@@ -1,0 +1,176 @@
+"""The posterior row by row: one update of every filter, and moves where particles run short.
+
+Where the effective size of the pilot falls to half of its particles, all populations are moved, by
+proposals whose filters pass over all rows so far (Chopin 2002, "A sequential particle filter method
+for static models", Biometrika 89, 539-551). With a noisy filter this is SMC^2 (Chopin, Jacob and
+Papaspiliopoulos 2013, "SMC^2", J. R. Stat. Soc. B 75, 397-426).
+
+After moves the variance of the log-likelihood at fixed parameters is measured at particles of the
+pilot. If it is large, the filters get twice as many members: the ratio of the new estimates to the
+old ones is a further factor, whose powers lead the populations across (`smc.bridge`) and whose
+weights enter the evidence.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple, Self
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from ..importance import systematic
+from ..smc.bridge import Cloud, Crossed, Stage, cross
+from ..smc.merging import merged_scores
+from ..smc.particles import Populations
+from .observed_rows import ObservedRows, exchanged, exchanging
+from .request import Request, Run, check_alive
+
+MAX_VARIANCE = 2.0  # of the log-likelihood at fixed parameters; beyond it members are doubled
+N_POINTS, N_REPEATS = 8, 8  # at and by which it is measured
+_PRIOR, _ROW = 0, 1  # keys of random numbers
+
+Array = NDArray[np.float64]
+
+
+class RowCourse(NamedTuple):
+    """What happened at one row; of the populations (R,), log-evidences are those so far."""
+
+    log_evidence: Array
+    effective_size: Array
+    n_stages: int
+    acceptance: float
+    n_members: int
+    variance: float
+    n_updates: int  # of filters, by one row
+
+
+class Progress(NamedTuple):
+    """A run after some rows: where it stands, what it has led through, and what goes on."""
+
+    rows: ObservedRows
+    cloud: Cloud
+    courses: list[RowCourse]
+
+    @classmethod
+    def before_any_row(cls, rows: ObservedRows, request: Request) -> Self:
+        """Draws of the prior."""
+        particles = rows.drawn(request.n_particles, request.generator(_PRIOR))
+        return cls(rows, request.cloud(particles), [])
+
+    @property
+    def n_rows(self) -> int:
+        """Rows so far."""
+        return len(self.courses)
+
+    @property
+    def log_evidences(self) -> Array:
+        """Of each population, (R,)."""
+        return self.courses[-1].log_evidence
+
+    def as_run(self) -> Run:
+        """For the output."""
+        return Run(self.cloud, self.log_evidences, course_dataset(self.courses))
+
+
+def advance(progress: Progress, request: Request, show: Callable[[float, str], None]) -> Progress:
+    """Lead a run through all rows of its record that it has not seen."""
+    while progress.n_rows < len(progress.rows.record.steps):
+        progress = _next_row(progress, request)
+        last = progress.courses[-1]
+        if progress.n_rows == 1:
+            check_alive(progress.rows.model, progress.cloud)
+        sizes = f"effective size {last.effective_size.mean():.0f}"
+        show(progress.n_rows, f"observation {progress.n_rows}, {sizes}")
+    return progress
+
+
+def _next_row(progress: Progress, request: Request) -> Progress:
+    rows, cloud, row = progress.rows, progress.cloud, progress.n_rows
+    rng = request.generator(_ROW, row)
+    before = 0.0 if row == 0 else progress.log_evidences
+    pilot, others = (
+        one._replace(particles=rows.with_row(one.particles, row))
+        for one in (cloud.pilot, cloud.others)
+    )
+    cloud = cloud._replace(pilot=pilot, others=others)
+    found = cross(cloud, rows.at_row(row), request.size, rng)
+    log_evidence, stages = before + found.log_ratio, found.stages
+    n_updates = request.n_particles + (row + 1) * _n_proposals(stages, request)
+    variance = np.nan
+    if stages and rows.filter.noisy:
+        variance = _variance(rows, found.cloud.pilot, row + 1, rng)
+        n_updates += N_POINTS * N_REPEATS * (row + 1)
+        if variance > MAX_VARIANCE:
+            rows, found = _doubled(rows, found.cloud, row + 1, request, rng)
+            log_evidence = log_evidence + found.log_ratio
+            stages = stages + found.stages
+            n_updates += (row + 1) * (request.n_particles + 2 * _n_proposals(found.stages, request))
+    course = RowCourse(
+        log_evidence,
+        found.cloud.others.effective_sizes,
+        len(stages),
+        float(np.mean([one.acceptance for one in stages])) if stages else np.nan,
+        n_members(rows),
+        variance,
+        n_updates,
+    )
+    return Progress(rows, found.cloud, [*progress.courses, course])
+
+
+def _n_proposals(stages: list[Stage], request: Request) -> int:
+    chains = request.size.n_chains * (1 + request.n_populations)
+    return sum(chains * one.n_steps for one in stages)
+
+
+def _variance(
+    rows: ObservedRows, pilot: Populations, n_rows: int, rng: np.random.Generator
+) -> float:
+    """The mean variance of the log-likelihood at fixed parameters, at particles of the pilot."""
+    index = systematic(np.exp(pilot.log_weights[0]), N_POINTS, rng)
+    x = np.repeat(pilot.particles.x[index], N_REPEATS, axis=0)
+    values = rows.estimated(x, n_rows, rng)[0].reshape(N_POINTS, N_REPEATS)
+    known = values[np.isfinite(values).all(axis=1)]
+    return float(known.var(axis=1, ddof=1).mean()) if len(known) else np.inf
+
+
+def _doubled(
+    rows: ObservedRows, cloud: Cloud, n_rows: int, request: Request, rng: np.random.Generator
+) -> tuple[ObservedRows, Crossed]:
+    """The populations with filters of twice as many members."""
+    larger = rows.of_size(2 * n_members(rows))
+    pilot, others = (
+        one._replace(particles=exchanged(larger, one.particles, n_rows, rng))
+        for one in (cloud.pilot, cloud.others)
+    )
+    evaluate = exchanging(rows, larger, n_rows)
+    cloud = cloud._replace(pilot=pilot, others=others)
+    return larger, cross(cloud, evaluate, request.size, rng)
+
+
+def n_members(rows: ObservedRows) -> int:
+    """Members of the filter; 0 of one without."""
+    size = getattr(rows.filter, "size", None)
+    return size() if size is not None and rows.filter.noisy else 0
+
+
+def course_dataset(courses: list[RowCourse]) -> xr.Dataset:
+    """What happened row by row: scores and their errors, sizes, moves."""
+    names = {"n_stages", "acceptance", "n_members", "variance", "n_updates"}
+    found = {
+        name: ("row", np.array([getattr(one, name) for one in courses]))
+        for name in RowCourse._fields
+        if name in names
+    }
+    paths = np.stack([one.log_evidence for one in courses], axis=1)
+    sizes = np.stack([one.effective_size for one in courses], axis=1)
+    scores, errors = merged_scores(paths)
+    of_populations = ("population", "row")
+    return xr.Dataset(
+        {
+            **found,
+            "score": ("row", scores),
+            "score_se": ("row", errors),
+            "effective_size": (of_populations, sizes),
+            "log_evidence_so_far": (of_populations, paths),
+        }
+    )

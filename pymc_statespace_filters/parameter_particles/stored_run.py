@@ -1,0 +1,124 @@
+"""Where a sequential run stands, as a Dataset from which it goes on, also after netCDF.
+
+It holds the particles with their weights, before any resampling for the posterior, the states of
+their filters, what the pilot has learnt, the record so far, and the key of the random numbers. The
+numbers of a row are a function of this key and the row, so that a run that goes on has the bits of
+one run over all rows.
+"""
+
+import json
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from ..errors import DataMismatchError, ModelError
+from ..pymc_model.filter_rows import Record
+from ..smc.bridge import Cloud
+from ..smc.moves import Size
+from ..smc.particles import Particles, Populations
+from ..system.graph_digest import digest, graph_digest
+from .observed_rows import ObservedRows
+from .output import COURSE
+from .request import Request
+from .sequential_run import Progress, RowCourse, n_members
+
+GROUP = "smc_state"
+_POPULATIONS = ("pilot", "others")
+_PATHS = {"log_evidence": "log_evidence_so_far"}  # fields of `RowCourse` by other names
+
+
+def stored(progress: Progress, request: Request) -> xr.Dataset | None:
+    """The state of a run; None of a model that no text identifies in another process."""
+    identity = None
+    with suppress(ModelError):
+        identity = _identity(progress.rows)
+    if identity is None:
+        return None
+    arrays = {f"record_{name}": values for name, values in progress.rows.record._asdict().items()}
+    for prefix, one in zip(_POPULATIONS, progress.cloud[:2], strict=True):
+        arrays |= {f"{prefix}_{name}": v for name, v in one.particles._asdict().items()}
+        arrays[f"{prefix}_log_weights"] = one.log_weights
+    found = {
+        name: ([f"{name}_dim_{i}" for i in range(np.ndim(values))], values)
+        for name, values in arrays.items()
+        if np.size(values)
+    }
+    attrs = {
+        "model": identity,
+        "entropy": json.dumps(request.entropy),
+        "draws": request.draws,
+        "waste_free": int(request.size.waste_free),
+        "populations": request.n_populations,
+        "scale": progress.cloud.scale,
+        "n_members": n_members(progress.rows),
+    }
+    return xr.Dataset(found, attrs=attrs)
+
+
+def restored(idata: xr.DataTree, rows: ObservedRows) -> tuple[Progress, Request]:
+    """The run of a result, with the record that it has seen.
+
+    Raises
+    ------
+    ModelError
+        If the result is not of a sequential run that can go on.
+    DataMismatchError
+        If it is of another model.
+    """
+    if not isinstance(idata, xr.DataTree) or GROUP not in idata.children:
+        raise ModelError(
+            f"idata must have the group {GROUP!r}, as sample_smc(data='sequential') returns it, "
+            f"got {sorted(idata.children) if isinstance(idata, xr.DataTree) else type(idata)}"
+        )
+    state = idata[GROUP].to_dataset()
+    attrs = state.attrs
+    if _identity(rows) != attrs["model"]:
+        raise DataMismatchError(
+            "model must be that of idata: its priors, parameters, system or filter are others"
+        )
+    draws, populations = int(attrs["draws"]), int(attrs["populations"])
+    size = Size.of(draws, bool(attrs["waste_free"]))
+    request = Request(draws, size, populations, tuple(json.loads(attrs["entropy"])))
+    if attrs["n_members"] != n_members(rows):
+        rows = rows.of_size(int(attrs["n_members"]))
+    pilot, others = (_populations(state, prefix) for prefix in _POPULATIONS)
+    cloud = Cloud(pilot, others, float(attrs["scale"]))
+    rows = rows.with_record(_record(state, rows))
+    return Progress(rows, cloud, _courses(idata[COURSE].to_dataset())), request
+
+
+def _populations(state: xr.Dataset, prefix: str) -> Populations:
+    x = state[f"{prefix}_x"].values
+    empty = {"seeds": np.empty((len(x), 0), np.int64)}
+    fields: dict[str, Any] = {
+        name: state[f"{prefix}_{name}"].values if f"{prefix}_{name}" in state else empty[name]
+        for name in Particles._fields
+    }
+    return Populations(Particles(**fields), state[f"{prefix}_log_weights"].values)
+
+
+def _record(state: xr.Dataset, rows: ObservedRows) -> Record:
+    inputs = np.zeros((0, rows.variable.system.n_input_columns))
+    if "record_inputs" in state:
+        inputs = state["record_inputs"].values
+    steps, observed = state["record_steps"].values, state["record_observed"].values
+    return Record(steps, observed, inputs, np.asarray(state["record_t0"].values))
+
+
+def _courses(course: xr.Dataset) -> list[RowCourse]:
+    columns = [course[_PATHS.get(name, name)].transpose("row", ...) for name in RowCourse._fields]
+    rows = zip(*(column.values for column in columns), strict=True)
+    return [RowCourse(*row) for row in rows]
+
+
+def _identity(rows: ObservedRows) -> str:
+    """A text that is the same for models that differ in their record alone."""
+    model, variable = rows.model, rows.variable
+    free = [model.rvs_to_values[rv] for rv in model.free_RVs]
+    graphs = [model.logp(vars=model.free_RVs), *model.replace_rvs_by_values([variable.theta])]
+    known = {value: digest("value of", str(value.name)) for value in free}
+    facts = [variable.name, variable.system.fingerprint, repr(variable.filter)]
+    facts += [str(variable.score_from), repr(variable.clock.unit)]
+    return digest(*facts, graph_digest(graphs, known))

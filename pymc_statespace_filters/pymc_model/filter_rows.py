@@ -1,0 +1,98 @@
+"""A filter at many points of a model, whose state is kept: one more row costs one update.
+
+Rows are evaluated at all points by machine code, in threads. A state is what
+`evaluation.run_filter` stores, so that a run that goes on has the bits of one run over all rows.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import pymc as pm
+from numpy.typing import NDArray
+from pymc.pytensorf import compile as compile_pymc
+from pytensor.graph.basic import Variable
+
+from ..compiler.native.planned_function import PlannedFunction
+from ..compiler.native.planned_rows import PlannedRow
+from ..compiler.native.rows import Rows, at_points
+from ..filters.protocol import Filter
+from ..filters.signatures import RESUMED
+from ..ops.base import kernel
+from ..ops.states import ResumableRun
+from ..system.model import StateSpaceModel
+
+_ARGUMENTS = [name for name, _ in RESUMED.arguments]
+_RESULTS = [name for name, _ in RESUMED.results]
+_KEPT = [_RESULTS.index("terms"), len(_RESULTS) - 1]  # and the state
+
+Array = NDArray[np.float64]
+
+
+class Record(NamedTuple):
+    """Steps (J,), data (J, p) and inputs of a record, and the time of step 0."""
+
+    steps: NDArray[np.int64]
+    observed: Array
+    inputs: Array
+    t0: np.ndarray
+
+    def rows(self, begin: int, end: int) -> "Record":
+        """Some rows, with the inputs of all."""
+        return self._replace(steps=self.steps[begin:end], observed=self.observed[begin:end])
+
+
+class ParametersAtPoints:
+    """The parameters of a variable as a function of points of the unconstrained space."""
+
+    def __init__(self, model: pm.Model, theta: Variable) -> None:
+        values = [model.rvs_to_values[rv] for rv in model.free_RVs]
+        start = model.initial_point()
+        self._shapes = [np.shape(start[value.name]) for value in values]
+        self._ends = np.cumsum([int(np.prod(shape)) for shape in self._shapes])[:-1]
+        (graph,) = model.replace_rvs_by_values([theta])
+        points, (theta_at,) = at_points(values, [graph])
+        # Machine code would take seconds to compile; NumPy takes all points in one call.
+        self._function = compile_pymc(
+            points, theta_at, mode="FAST_COMPILE", on_unused_input="ignore", trust_input=True
+        )
+
+    def __call__(self, x: Array) -> Array:
+        """Parameters (m, n_theta) at points (m, k)."""
+        parts = np.split(x, self._ends, axis=1)
+        points = [
+            part.reshape(len(x), *shape) for part, shape in zip(parts, self._shapes, strict=True)
+        ]
+        return np.ascontiguousarray(self._function(*points), dtype=np.float64)
+
+
+class FilterRows:
+    """The filter of one system along rows of a record, for many parameters and seeds at once."""
+
+    def __init__(self, system: StateSpaceModel, filter: Filter) -> None:
+        self.filter = filter
+        function = kernel(ResumableRun(system, filter))
+        assert isinstance(function, PlannedFunction)  # all filters that resume have a plan
+        self._function = function.loaded()
+
+    def __call__(
+        self,
+        theta: Array,
+        seeds: NDArray[np.int64],
+        states: Array,
+        record: Record,
+    ) -> tuple[Array, Array]:
+        """Terms (m, J) of the rows of a record, and the states behind them.
+
+        ``states`` (m, S) are those before the rows; of no columns where the rows are the first.
+        """
+        varying = {"theta": theta, "seed": seeds}
+        given = {**record._asdict(), "wanted": np.empty(0, np.int64)}
+        (varying if states.shape[1] else given)["state"] = (
+            states if states.shape[1] else np.empty(0)
+        )
+        order = [*varying, *given]
+        example = [np.asarray(values[0]) for values in varying.values()]
+        example += [np.asarray(value) for value in given.values()]
+        row = PlannedRow(self._function, [_ARGUMENTS.index(name) for name in order], example, _KEPT)
+        terms, after = Rows(row, len(varying))(*varying.values())
+        return terms, after

@@ -1,0 +1,104 @@
+r"""Populations led from one distribution to the next, along temperatures that a pilot chooses.
+
+The distributions :math:`p(x) L(x) l(x)^\beta` lead from those before, at :math:`\beta = 0`, to
+those after a factor :math:`l` of the likelihood, at :math:`\beta = 1`: the whole likelihood, that
+of one more observation, or the ratio of two estimates. The particles are weighted by
+:math:`l^{\beta' - \beta}`; where the effective size of the pilot falls to half of its particles,
+they are resampled and moved (Del Moral, Doucet and Jasra 2006; Chopin 2002; Chopin, Jacob and
+Papaspiliopoulos 2013). The mean weights multiply to
+
+.. math::
+
+    \hat p = \prod_t \sum_i W_i^{(t)} l(x_i)^{\beta_{t+1} - \beta_t},
+
+an unbiased estimate of the ratio of the two integrals in every population but the pilot, whose
+particles decide when the others are moved, and how.
+
+A noisy likelihood is the estimate that is stored with its point: on the space of points and noise
+the same formulas hold, and the noise integrates out where the estimate is unbiased.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .kernel import fitted_kernel
+from .moves import Moved, Size, move_others, move_pilot
+from .particles import Evaluate, Populations
+from .temperature import next_temperature
+
+ESS_FRACTION = 0.5  # of the pilot's particles, at which all are moved
+
+Array = NDArray[np.float64]
+
+
+class Stage(NamedTuple):
+    """What happened at one temperature; effective sizes (R,) are those before the moves."""
+
+    temperature: float
+    effective_sizes: Array
+    n_steps: int
+    acceptance: float
+    scale: float
+
+
+class Cloud(NamedTuple):
+    """The pilot, the other populations, and the length of the steps that the pilot has learnt."""
+
+    pilot: Populations
+    others: Populations
+    scale: float = 1.0
+
+
+class Crossed(NamedTuple):
+    """Where a bridge has led, the log of each population's estimate of the ratio, and how."""
+
+    cloud: Cloud
+    log_ratio: Array  # (R,)
+    stages: list[Stage]
+
+
+def cross(
+    cloud: Cloud,
+    evaluate: Evaluate,
+    size: Size,
+    rng: np.random.Generator,
+    *,
+    refresh: bool = False,
+    on_stage: Callable[[Stage], None] = lambda stage: None,
+) -> Crossed:
+    """Lead the populations across; with ``refresh`` they are resampled and moved at the end, too.
+
+    The increments of the particles are those of the factor; ``evaluate`` gives them at new points.
+    """
+    temperature, log_ratio = 0.0, np.zeros(len(cloud.others.log_weights))
+    stages: list[Stage] = []
+    while True:
+        pilot = cloud.pilot
+        raised = next_temperature(
+            temperature, pilot.particles.increment, ESS_FRACTION, pilot.log_weights[0]
+        )
+        pilot, _ = pilot.raised(raised - temperature)
+        others, log_mean = cloud.others.raised(raised - temperature)
+        log_ratio += log_mean
+        temperature, cloud = raised, cloud._replace(pilot=pilot, others=others)
+        if temperature == 1.0 and not refresh:
+            return Crossed(cloud, log_ratio, stages)
+        sizes = others.effective_sizes
+        cloud, moved = _moved(cloud, temperature, evaluate, size, rng)
+        stages.append(Stage(temperature, sizes, moved.n_steps, moved.acceptance, cloud.scale))
+        on_stage(stages[-1])
+        if temperature == 1.0:
+            return Crossed(cloud, log_ratio, stages)
+
+
+def _moved(
+    cloud: Cloud, temperature: float, evaluate: Evaluate, size: Size, rng: np.random.Generator
+) -> tuple[Cloud, Moved]:
+    """The cloud with all populations moved at one temperature, and how the others were."""
+    kernel = fitted_kernel(cloud.pilot, cloud.scale, rng)
+    pilot, kernel = move_pilot(cloud.pilot, kernel, temperature, evaluate, size, rng)
+    others = move_others(cloud.others, kernel, pilot.n_steps, temperature, evaluate, size, rng)
+    return Cloud(pilot.populations, others.populations, kernel.scale), others

@@ -1,0 +1,45 @@
+"""A linear record, and its exact evidence after each row, by Kalman's filter and quadrature."""
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import pymc as pm
+from scipy.special import logsumexp
+from scipy.stats import norm
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.testing import kalman_log_likelihood
+from tests.systems import FREE
+
+STEPS = np.arange(1, 25)
+DATA = psf.simulate(FREE, {"a": 0.8}, steps=STEPS, random_seed=1)["observations"].values
+DATA[7] = np.nan
+
+
+class Exact(NamedTuple):
+    """Log-evidences of the first rows (J,), and the posterior mean of `a` given all."""
+
+    path: np.ndarray
+    mean: float
+
+
+def model(filter, n_rows=None, **changes):
+    """The model of the first rows."""
+    with pm.Model() as built:
+        pm.Normal("a", 0, 2)
+        settings = {"steps": STEPS[:n_rows], "observed": DATA[:n_rows]} | changes
+        psf.StateSpace("d", FREE, filter, **settings)
+    return built
+
+
+@cache
+def exact():
+    """Trapezoids on a grid that holds the posterior given any number of rows, but the first few."""
+    a, width = np.linspace(-10, 10, 801, retstep=True)
+    noise = {"steps": STEPS, "observed": DATA}
+    terms = [kalman_log_likelihood([[v]], [[1]], [[1]], [[0.5]], [0], [[1]], **noise) for v in a]
+    log_joint = np.cumsum(terms, axis=1) + norm(0, 2).logpdf(a)[:, None]
+    path = logsumexp(log_joint, axis=0) + np.log(width)
+    weights = np.exp(log_joint[:, -1] - path[-1]) * width
+    return Exact(path, float(weights @ a))

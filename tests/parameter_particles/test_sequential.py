@@ -1,0 +1,204 @@
+"""Sequential runs against the exact evidence after each row, and their extension."""
+
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.pymc_model.density import ModelDensity
+from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
+from tests.parameter_particles.autoregression import DATA, STEPS, exact, model
+from tests.systems import FORCED, FREE, pair
+
+SETTINGS = {"data": "sequential", "random_seed": 2, "progressbar": False}
+
+
+@pytest.fixture(scope="module")
+def by_filter():
+    """Runs over all rows: the noisier filter has its members doubled on the way."""
+    return {
+        filter: psf.sample_smc(150, model=model(filter), **SETTINGS)
+        for filter in (psf.EKF(), psf.BootstrapPF(6))
+    }
+
+
+@pytest.mark.parametrize("filter", [psf.EKF(), psf.BootstrapPF(6)])
+def test_evidences_scores_and_posterior_are_exact(by_filter, filter):
+    """At each of 24 rows within 4.5 errors, of 10 populations, of quadrature."""
+    found, truth = by_filter[filter], exact()
+    course = found["smc"].to_dataset()
+    scores = np.diff(truth.path, prepend=0.0)
+    assert (abs(course["score"] - scores) <= 4.5 * course["score_se"] + 1e-12).all()
+    assert abs(found.attrs["log_evidence"] - truth.path[-1]) < 4 * found.attrs["log_evidence_se"]
+    error = found["mcse"]["a"].item()
+    assert abs(found["posterior"]["a"].mean().item() - truth.mean) < 4 * error < 0.2
+    np.testing.assert_allclose(course["score"].sum(), found.attrs["log_evidence"])
+    assert course["score"][7] == course["score_se"][7] == 0.0  # a missing row
+    assert 0 < course["n_stages"].sum() < 24
+
+
+def test_members_are_doubled_and_the_stored_estimates_are_theirs(by_filter):
+    found = by_filter[psf.BootstrapPF(6)]
+    course = found["smc"].to_dataset()
+    n_members = int(course["n_members"][-1])
+    assert n_members > 6
+    doubled = np.diff(course["n_members"], prepend=6) > 0
+    np.testing.assert_array_equal(doubled, course["variance"] > 2)
+    assert f"BootstrapPF({n_members})" in found.attrs["filter"]
+    built = model(psf.BootstrapPF(n_members))
+    x = unconstrained_draws(found, built).reshape(-1, 1)
+    stats = found["sample_stats"]
+    recomputed = ModelDensity(built).evaluate(x, stats["d_seed"].values.reshape(-1, 1))
+    np.testing.assert_allclose(stats["lp"].values.ravel(), recomputed, rtol=1e-9)
+
+
+def test_states_and_forecasts_follow_from_the_draws(by_filter):
+    found, built = by_filter[psf.EKF()].copy(), model(psf.EKF())
+    ahead = psf.forecast(found, built, n_steps=2, n_draws=20, random_seed=1, progressbar=False)
+    assert ahead["predictions"]["d"].sizes["d_time"] == 2
+
+
+@pytest.mark.parametrize("filter", [psf.EKF(), psf.BootstrapPF(6)])
+def test_a_run_that_is_extended_is_one_run(by_filter, filter, tmp_path):
+    first = psf.sample_smc(150, model=model(filter, 9), **SETTINGS)
+    first.to_netcdf(tmp_path / "run.nc")
+    first = xr.load_datatree(tmp_path / "run.nc")
+    # Rows that were seen may come again.
+    longer = psf.extend(
+        first, model(filter, 9), observed=DATA[5:15], steps=STEPS[5:15], progressbar=False
+    )
+    longer = psf.extend(
+        longer, model(filter), observed=DATA[15:], steps=STEPS[15:], progressbar=False
+    )
+    whole = by_filter[filter]
+    assert longer.attrs == whole.attrs
+    for name in whole.children:
+        if name != "predictions":
+            assert longer[name].to_dataset().equals(whole[name].to_dataset())
+
+
+def _leaking(**settings):
+    """Counts what has left between two rows; steps of any length, or of a grid."""
+    system = psf.StateSpaceModel(
+        psf.EulerMaruyama(
+            lambda x, k: [-k * x[0], k * x[0]], lambda: [[0.2, 0.0], [0.0, 0.01]], dt=0.5
+        ),
+        observation=lambda x: [x[1]],
+        observation_noise=[[0.05]],
+        initial_mean=[1.0, 0.0],
+        initial_cov=[[0.1, 0.0], [0.0, 0.001]],
+        accumulators=["x1"],
+    )
+    with pm.Model() as built:
+        pm.HalfNormal("k", 2)
+        psf.StateSpace("d", system, psf.EKF(), **settings)
+    return built
+
+
+def _forced(**settings):
+    with pm.Model() as built:
+        pm.Normal("a", 0, 1)
+        psf.StateSpace("d", FORCED, psf.EKF(), **settings)
+    return built
+
+
+OFF_GRID = np.array([0.4, 1.1, 1.3, 2.9, 3.0, 4.2, 5.1])
+DATES = np.datetime64("2024-01-01") + np.array([0, 2, 3, 7, 8, 12, 13]).astype("m8[D]")
+FORCE = np.sin(np.arange(20.0))
+RECORDS = {
+    "off the grid": (_leaking, {"times": OFF_GRID}, {}),
+    "dates": (_leaking, {"times": DATES}, {"unit": "D"}),
+    "accumulated": (_leaking, {"steps": np.arange(2, 16, 2)}, {}),
+    "with inputs": (_forced, {"steps": np.arange(2, 16, 2)}, {"inputs": FORCE}),
+}
+
+
+@pytest.mark.filterwarnings("ignore:the log-evidence")  # few particles
+@pytest.mark.parametrize("record", list(RECORDS))
+def test_records_with_times_and_inputs_go_on(record):
+    build, at, others = RECORDS[record]
+    (name, when), y = next(iter(at.items())), DATA[8:15]
+    settings = SETTINGS | {"draws": 30, "populations": 2}
+    whole = psf.sample_smc(model=build(observed=y, **at, **others), **settings)
+    short = build(observed=y[:4], **{name: when[:4]}, **others)
+    first = psf.sample_smc(model=short, **settings)
+    more = {key: value for key, value in others.items() if key == "inputs"}
+    longer = psf.extend(first, short, observed=y[4:], **{name: when[4:]}, **more, progressbar=False)
+    assert longer["observed_data"].to_dataset().equals(whole["observed_data"].to_dataset())
+    assert longer["posterior"].to_dataset().equals(whole["posterior"].to_dataset())
+    assert longer["evidence"].to_dataset().equals(whole["evidence"].to_dataset())
+
+
+def test_an_extension_that_disagrees_is_refused(by_filter):
+    found, built = by_filter[psf.EKF()], model(psf.EKF())
+
+    def refused(error, match, of=built, **arguments):
+        with pytest.raises(error, match=match):
+            psf.extend(found, of, progressbar=False, **arguments)
+
+    refused(DataMismatchError, r"observed\[0\] = \[9.0\] disagrees", observed=[9.0], steps=[3])
+    refused(DataMismatchError, r"steps\[0\] = 0 lies before", observed=[9.0], steps=[0])
+    seen = {"observed": DATA[-2:], "steps": STEPS[-2:]}
+    refused(ModelError, "go on after the last row seen", **seen)
+    refused(ModelError, "exactly one of steps and times", observed=[9.0])
+    new = {"observed": [9.0], "steps": [30]}
+    refused(DataMismatchError, "model must be that of idata", of=model(psf.UKF()), **new)
+    with pm.Model() as other:
+        pm.Normal("a", 0, 1)
+        psf.StateSpace("d", FREE, psf.EKF(), steps=STEPS, observed=DATA)
+    refused(DataMismatchError, "model must be that of idata", of=other, **new)
+    tempered = psf.sample_smc(50, model=built, populations=2, random_seed=1, progressbar=False)
+    with pytest.raises(ModelError, match="idata must have the group 'smc_state'"):
+        psf.extend(tempered, built, **new)
+
+
+def test_data_that_do_not_come_row_by_row_are_refused():
+    def refused(match, build):
+        with pytest.raises(ModelError, match=rf"data='sequential' needs .*{match}"):
+            psf.sample_smc(20, model=build, **SETTINGS)
+
+    refused("GuidedPF cannot: its guide needs the record ahead", model(psf.GuidedPF(20)))
+    refused("GridFilter cannot", model(psf.GridFilter()))
+    refused("score_from=0", model(psf.BootstrapPF(20), score_from=2))
+    with model(psf.EKF()) as two:
+        psf.StateSpace("e", FREE, psf.EKF(), steps=STEPS, observed=DATA)
+    refused(r"got \['d', 'e'\]", two)
+    with model(psf.EKF()) as bent:
+        pm.Potential("bent", -(bent["a"] ** 4))
+    refused(r"got \['d', 'bent'\]", bent)
+    refused("got a panel in 'd'", model(psf.EKF(), panel=np.repeat([0, 1], 12)))
+    with pm.Model() as moving:
+        a = pm.Normal("a")
+        psf.StateSpace(
+            "d", FORCED, psf.EKF(), steps=STEPS, observed=DATA, inputs=a * np.ones((24, 1))
+        )
+    refused("inputs that do not depend", moving)
+
+
+def test_a_score_counts_from_a_row_on():
+    """The evidence is then p(d_3 .. d_J | d_1, d_2, prior), as in the model's log-density."""
+    built = model(psf.EKF(), score_from=2)
+    both = [
+        psf.sample_smc(100, model=built, **SETTINGS | {"data": data})
+        for data in ("tempered", "sequential")
+    ]
+    one, other = (found.attrs for found in both)
+    error = np.hypot(one["log_evidence_se"], other["log_evidence_se"])
+    assert abs(one["log_evidence"] - other["log_evidence"]) < 4 * error < 1.0
+    assert (both[1]["smc"]["score"][:2] == 0).all()
+
+
+def test_several_parameters_and_observables():
+    with pm.Model() as built:
+        pm.Normal("a", 0.5, 0.5)
+        pm.Normal("b", 0, 0.5)
+        record = psf.simulate(pair(), {"a": 0.5}, steps=STEPS, random_seed=3)["observations"]
+        psf.StateSpace("d", pair(), psf.EKF(), steps=STEPS, observed=record)
+    found = [
+        psf.sample_smc(100, model=built, **SETTINGS | {"data": data}).attrs
+        for data in ("tempered", "sequential")
+    ]
+    error = np.hypot(*(one["log_evidence_se"] for one in found))
+    assert abs(found[0]["log_evidence"] - found[1]["log_evidence"]) < 4 * error < 1.0
