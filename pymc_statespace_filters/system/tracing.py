@@ -285,14 +285,16 @@ def _with_finite_step(
     begin: TensorVariable,
 ) -> Equations:
     """The equations with a step given the values of finite variables, if there are any."""
-    given = None if symbols.drawn is None else symbols.drawn.given
-    if given is None:
+    drawn = symbols.drawn
+    if drawn is None or drawn.given is None:
         return equations
-    q = given.entries.copy(name="q")
-    step = as_vector("transition", functions.transition.step({**symbols.values, "q": q}), symbols.n)
-    both = graph_replace(
-        pt.concatenate([step, given.law]), {symbols.values["x"]: begin}, strict=False
+    given, q = drawn.given, drawn.given.entries.copy(name="q")
+    step = functions.transition.step({**symbols.values, "q": q})
+    step = _with_moves(as_vector("transition", step, symbols.n_written), symbols)
+    (both,) = graph_replace(
+        [pt.concatenate([step, given.law])], {drawn.normals: symbols.values["q"]}, strict=False
     )
+    both = graph_replace(both, {symbols.state: begin}, strict=False)
     graph = freeze([*inputs, given.values], [both], "process_dist")
     others_are_gaussian = equations.others_are_gaussian and given.others_are_gaussian
     return replace(equations, finite_step=graph, others_are_gaussian=others_are_gaussian)
