@@ -35,6 +35,7 @@ def scripts(monkeypatch):
         "armadillo",
         "kangaroos",
         pytest.param("earthquakes", marks=pytest.mark.slow),
+        pytest.param("growth", marks=pytest.mark.slow),
         pytest.param("neurons", marks=pytest.mark.slow),
         pytest.param("lorenz_63", marks=pytest.mark.slow),
         pytest.param("measles", marks=pytest.mark.slow),

@@ -22,6 +22,7 @@ STUDIES = (
     "armadillo",
     "kangaroos",
     "earthquakes",
+    "growth",
 )
 TABLE = Path(__file__).parents[2] / "docs" / "_static" / "published.inc"
 

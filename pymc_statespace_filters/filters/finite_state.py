@@ -14,7 +14,7 @@ from ..errors import ModelError
 from ..system.checks import is_integer
 from .markov_chain.backward import BACKWARD
 from .markov_chain.forward import FORWARD
-from .markov_chain.functions import chain_functions
+from .markov_chain.functions import chain_functions, is_smooth_in_parameters
 from .markov_chain.predictions import PREDICTIONS_OF_CHAIN
 from .markov_chain.states import MOMENTS, RUN_OF_CHAIN, STATES_OF_CHAIN
 from .plan import make_plan
@@ -131,6 +131,13 @@ class FiniteStateFilter:
     def is_exact_for(self, system: System) -> bool:
         """Whether the likelihood is that of the system."""
         return system.has_exact_observation_density
+
+    def is_smooth_for(self, system: System) -> bool:
+        """Whether the likelihood has no kink or jump as a function of the parameters.
+
+        Choices between values of the state are none. False if unknown.
+        """
+        return is_smooth_in_parameters(system.model)
 
     def compile(self, system: System) -> PlannedFunction:
         """Compile the log-likelihood."""

@@ -296,8 +296,8 @@ def _with_finite_step(
     )
     both = graph_replace(both, {symbols.state: begin}, strict=False)
     graph = freeze([*inputs, given.values], [both], "process_dist")
-    others_are_gaussian = equations.others_are_gaussian and given.others_are_gaussian
-    return replace(equations, finite_step=graph, others_are_gaussian=others_are_gaussian)
+    are_gaussian = equations.others_are_gaussian and given.others_are_gaussian
+    return replace(equations, finite_step=graph, others_are_gaussian=are_gaussian)
 
 
 def _of_length(functions: Functions, symbols: Symbols) -> Functions:

@@ -14,6 +14,7 @@ from pymc_statespace_filters.filters.outcomes import Failure
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.ops.states import Predictions, States
+from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.parameters import flat_parameters
 from pymc_statespace_filters.system.record import checked_record
 
@@ -84,9 +85,19 @@ def wear_log_likelihood(p, rate, observed, steps):
     return np.log(total)
 
 
+def arguments_of(system, params, record):
+    """The arguments of a likelihood."""
+    rows = checked_record(system, GivenRecord(**record)).arguments
+    return (flat_parameters(system, params), *rows, 0)
+
+
 def gradient(system, filter, params, record, weights=None):
     """A weighted sum of terms and its derivative."""
-    arguments = (flat_parameters(system, params), *checked_record(system, **record).arguments, 0)
+    arguments = (
+        flat_parameters(system, params),
+        *checked_record(system, GivenRecord(**record)).arguments,
+        0,
+    )
     likelihood = LogLikelihood(system, filter)
     terms, _ = evaluator(likelihood)(*arguments)
     weights = 1.0 + 0.1 * np.arange(terms.size) if weights is None else weights
@@ -96,12 +107,15 @@ def gradient(system, filter, params, record, weights=None):
 
 def by_differences(system, filter, params, record):
     """The same derivative, by central differences of fourth order."""
-    theta, row = flat_parameters(system, params), checked_record(system, **record).arguments
+    theta, row = (
+        flat_parameters(system, params),
+        checked_record(system, GivenRecord(**record)).arguments,
+    )
     run, found = evaluator(LogLikelihood(system, filter)), []
     for i in range(theta.size):
 
         def value(step, i=i):
-            terms, _ = run(theta + step * np.eye(theta.size)[i], *row, 0)
+            terms, _ = run(theta + step * np.eye(theta.size)[i], *row)
             return terms @ (1.0 + 0.1 * np.arange(terms.size))
 
         h = 1e-3
@@ -160,8 +174,7 @@ def test_two_thousand_observations():
 
 def states(moment, seeds, system=SWITCH, given=GIVEN, record=RECORD):
     """Mean, sd and draws of the states at all steps."""
-    checked = checked_record(system, **record)
-    arguments = (flat_parameters(system, given), *checked.arguments, 0)
+    arguments = arguments_of(system, given, record)
     run = evaluator(States(system, psf.FiniteStateFilter(), moment))
     wanted = np.arange(record["steps"][-1] + 1)
     found = [run(*arguments, wanted, seed) for seed in seeds]
@@ -248,8 +261,8 @@ def test_failures_are_counted_with_their_row():
         (0.2, impossible, Failure.ZERO_DENSITY, 3),
         (0.7, COUNTS["observed"], Failure.INVALID_PROBABILITY, 0),
     ):
-        record = checked_record(WEAR, **COUNTS | {"observed": observed}).arguments
-        terms, health = likelihood(flat_parameters(WEAR, WORN | {"p": [p]}), *record, 0)
+        record = COUNTS | {"observed": observed}
+        terms, health = likelihood(*arguments_of(WEAR, WORN | {"p": [p]}, record))
         assert (Failure(int(health[1])), health[2]) == (failure, row)
         assert np.isneginf(terms[row:]).all()
         assert np.isfinite(terms[:row]).all()
@@ -268,7 +281,11 @@ def test_densities_far_below_that_of_an_impossible_state():
 
 def test_laws_of_observations():
     """PIT values of `filter_diagnostics` are those of the mixture over the predicted states."""
-    arguments = (flat_parameters(SWITCH, GIVEN), *checked_record(SWITCH, **RECORD).arguments, 0)
+    arguments = (
+        flat_parameters(SWITCH, GIVEN),
+        *checked_record(SWITCH, GivenRecord(**RECORD)).arguments,
+        0,
+    )
     mean, _, below, _ = evaluator(Predictions(SWITCH, psf.FiniteStateFilter()))(*arguments)
     hidden = RECORD | {"observed": np.full((5, 2), np.nan)}
     paths, log_p = switch_paths(**GIVEN, **hidden)

@@ -29,7 +29,7 @@ from .symbols import (
 )
 
 _N_TRIALS = 5
-_KINKED = (
+KINKED = (
     ps.Switch, ps.Abs, ps.ScalarMaximum, ps.ScalarMinimum, ps.Clip, ps.Sign, ps.Floor, ps.Ceil,
     ps.Mod, ps.IntDiv, ps.Cast,
 )  # fmt: skip
@@ -212,7 +212,7 @@ def _is_smooth(
         (values,) = unrolled(Graph(symbols, [vector]))
     except NotUnrollableError:
         return False
-    return not any(isinstance(e.op, _KINKED) for e in depends_on(values, frozenset(inputs)))
+    return not any(isinstance(e.op, KINKED) for e in depends_on(values, frozenset(inputs)))
 
 
 def step_moments(system: StateSpaceModel, symbols: Mapping[str, TensorVariable]) -> TensorVariable:

@@ -9,18 +9,20 @@ last four values has as many different probabilities as the regime alone. Each f
 one with its derivatives by the parameters on which it depends.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import pytensor
+import pytensor.scalar as ps
 import pytensor.tensor as pt
 from pytensor.graph.basic import Variable
 from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
-from ...compiler.codegen.expressions import is_constant
+from ...compiler.codegen.emitter import depends_on
+from ...compiler.codegen.expressions import Expression, is_constant
 from ...compiler.codegen.function_types import Graph
 from ...compiler.codegen.functions import member_function, unrolled
 from ...compiler.codegen.scalarize import NotUnrollableError
@@ -34,7 +36,8 @@ from ...compiler.lowering.finite_states import (
     step_symbols,
 )
 from ...compiler.lowering.observation import observation_log_density
-from ...compiler.lowering.symbols import symbols_of
+from ...compiler.lowering.structure import KINKED
+from ...compiler.lowering.symbols import call, symbols_of
 from ...compiler.native.entry_point import EntryPoint
 from ...system.model import StateSpaceModel
 from ..protocol import System
@@ -125,6 +128,37 @@ def _emission(model: StateSpaceModel) -> tuple[dict[str, TensorVariable], Tensor
     # Rows that are wholly missing are not evaluated.
     density = observation_log_density(model, given, is_complete=model.p == 1)
     return {**{i: symbols[i] for i in ("theta", *"xut")}, "z": symbols["d"]}, density
+
+
+def is_smooth_in_parameters(model: StateSpaceModel) -> bool:
+    """Whether probabilities and the observation have no kink or jump in theta; False if unknown.
+
+    Distributions of observations count as smooth.
+    """
+    symbols, step = step_symbols(model)
+    of_start, start = start_symbols(model)
+    n_v, n_start = (given["v"].type.shape[0] for given in (symbols, of_start))
+    graphs = [
+        Graph(symbols, [step[model.n : model.n + n_v]]),
+        Graph(of_start, [start[model.n : model.n + n_start]]),
+    ]
+    if model.equations.observation is not None:
+        graphs.append(Graph(symbols, [call(model.equations.observation, model, symbols)]))
+    try:
+        values = [value for graph in graphs for value in unrolled(graph)[0]]
+    except NotUnrollableError:
+        return False
+    theta = frozenset(f"theta.{i}" for i in range(model.n_theta))
+    dependent = depends_on(values, theta)
+    return not any(_bends(e, dependent) for e in dependent)
+
+
+def _bends(e: Expression, dependent: Collection[Expression]) -> bool:
+    """Whether an operation has a kink or jump in arguments that are ``dependent``."""
+    return isinstance(e.op, KINKED) and any(
+        isinstance(a, Expression) and a in dependent
+        for a in (e.args[:1] if isinstance(e.op, ps.Switch) else e.args)
+    )
 
 
 @dataclass(frozen=True)
