@@ -93,11 +93,7 @@ def arguments_of(system, params, record):
 
 def gradient(system, filter, params, record, weights=None):
     """A weighted sum of terms and its derivative."""
-    arguments = (
-        flat_parameters(system, params),
-        *checked_record(system, GivenRecord(**record)).arguments,
-        0,
-    )
+    arguments = arguments_of(system, params, record)
     likelihood = LogLikelihood(system, filter)
     terms, _ = evaluator(likelihood)(*arguments)
     weights = 1.0 + 0.1 * np.arange(terms.size) if weights is None else weights
@@ -107,10 +103,7 @@ def gradient(system, filter, params, record, weights=None):
 
 def by_differences(system, filter, params, record):
     """The same derivative, by central differences of fourth order."""
-    theta, row = (
-        flat_parameters(system, params),
-        checked_record(system, GivenRecord(**record)).arguments,
-    )
+    theta, *row = arguments_of(system, params, record)
     run, found = evaluator(LogLikelihood(system, filter)), []
     for i in range(theta.size):
 
