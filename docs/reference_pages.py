@@ -103,6 +103,7 @@ GROUPS = {
         "plot_filter_health",
         "plot_evidence",
         "plot_model_probabilities",
+        "plot_prequential",
         "plot_prior_sensitivity",
         "plot_average",
     ),

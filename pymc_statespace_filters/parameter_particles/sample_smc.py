@@ -102,6 +102,7 @@ def sample_smc(
     sample : Chains, which take fewer evaluations for one posterior.
     estimate_evidence : The evidence from draws of any sampler.
     plot_prequential : Which rows speak for which model.
+    plot_prequential : Which rows speak for which model.
 
     Notes
     -----

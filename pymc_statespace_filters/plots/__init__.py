@@ -6,6 +6,7 @@ from .filter_health import plot_filter_health
 from .forecast import plot_forecast
 from .phase import plot_phase
 from .predictive import plot_predictive
+from .prequential import plot_prequential
 from .prior_sensitivity import plot_prior_sensitivity
 from .residuals import plot_residuals
 from .states import plot_states
@@ -18,6 +19,7 @@ __all__ = [
     "plot_model_probabilities",
     "plot_phase",
     "plot_predictive",
+    "plot_prequential",
     "plot_prior_sensitivity",
     "plot_residuals",
     "plot_states",

@@ -205,8 +205,9 @@ def _draw_truth(
 ) -> dict[str, dict[str, Any]]:
     """Draw the actual observations from the predictions on; return their legend entry."""
     if record is not None:
-        begin = np.minimum(draws["time"][0], np.nextafter(record["time"][-1], np.inf))
-        truth = truth.where(truth["time"] >= begin.item(), drop=True)
+        times = truth["time"]  # numbers or dates
+        is_later = (times >= draws["time"].values[0]) | (times > record["time"].values[-1])
+        truth = truth.where(is_later, drop=True)
     actual = truth.reindex(observable=draws["observable"])
     style = {"color": TRUTH["color"], **point_size(actual)}
     collection.map(points, "truth", data=actual.to_dataset(name="truth"), **style)

@@ -56,6 +56,20 @@ def test_what_came_is_drawn_after_the_end_of_the_record_alone(forecast):
     np.testing.assert_array_equal(truth["position"]["y"], -TIMES[31:])
 
 
+def test_what_came_is_drawn_at_dates(forecast):
+    dates = np.datetime64("2024-01-01") + np.arange(TIMES.size).astype("m8[D]")
+    dated = xr.DataTree.from_dict(
+        {
+            "predictions": forecast["predictions"].to_dataset().assign_coords(d_time=dates[31:]),
+            "observed_data": forecast["observed_data"]
+            .to_dataset()
+            .assign_coords(d_time=dates[:31]),
+        }
+    )
+    truth = drawn(plot_forecast(dated, truth=np.ones((10, 2)), backend="none"), "truth")
+    np.testing.assert_array_equal(truth["speed"]["x"], dates[31:])
+
+
 def test_dimensions_of_the_users_names(forecast):
     renamed = xr.DataTree.from_dict(
         {

@@ -1,0 +1,93 @@
+"""Rival models row by row, as drawn and as numbers."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.parameter_particles.running_comparison import running_comparison
+from tests.plots.drawn import drawn
+
+ROWS = np.array([2.0, 5.0, 6.0])
+
+
+def course(paths, rows=ROWS, fingerprint="0c5f"):
+    """A sequential run by the log-evidences of its populations after each row."""
+    paths = np.asarray(paths)
+    scores = np.diff(paths.mean(axis=0), prepend=0.0)
+    found = xr.Dataset(
+        {
+            "log_evidence_so_far": (("population", "row"), paths),
+            "score": ("row", scores),
+            "score_se": ("row", np.full(len(rows), 0.1)),
+        },
+        coords={"row": rows},
+    )
+    evidence = xr.Dataset(
+        {"data_fingerprint": ("estimator", [fingerprint])}, coords={"estimator": ["smc"]}
+    )
+    return xr.DataTree.from_dict({"smc": found, "evidence": evidence})
+
+
+RIVALS = {
+    "one": course([[-1.0, -2.0, -4.0]] * 2),
+    "two": course([[-2.0, -2.0, -3.0]] * 2),
+}
+NOISY = RIVALS | {"two": course(np.add.outer([0.2, -0.2], [-2.0, -2.0, -3.0]))}
+
+
+def test_numbers():
+    table = running_comparison(RIVALS)
+    np.testing.assert_allclose(table["score_difference"].sel(model="two"), [-1.0, 1.0, 1.0])
+    np.testing.assert_allclose(table["log_bayes_factor"].sel(model="two"), [-1.0, 0.0, 1.0])
+    odds = 1 / (1 + np.exp([1.0, 0.0, -1.0]))
+    np.testing.assert_allclose(table["probability"].sel(model="two"), odds)
+    np.testing.assert_allclose(table["probability_low"].sel(model="two"), odds)
+    np.testing.assert_array_equal(table["row"], ROWS)
+
+
+def test_errors_widen_bands():
+    table = running_comparison(NOISY).sel(model="two")
+    assert (table["log_bayes_factor_se"] > 0.2).all()
+    assert (table["probability_low"] < table["probability"]).all()
+    assert (table["probability_high"] > table["probability"]).all()
+
+
+@pytest.mark.parametrize("backend", ["none", "matplotlib", "plotly", "bokeh"])
+def test_every_backend_draws(backend):
+    collection = psf.plot_prequential(NOISY, backend=backend)
+    if backend == "none":
+        factor = drawn(collection, "factor_two")["log_bayes_factor"]
+        np.testing.assert_array_equal(factor["x"], ROWS)
+        np.testing.assert_allclose(factor["y"], [-1.0, 0.0, 1.0], atol=0.05)
+        score = np.asarray(drawn(collection, "score_two")["score_difference"]["y"])
+        np.testing.assert_allclose(score[1::3], [-1.0, 1.0, 1.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("results", "error", "match"),
+    [
+        ({"one": RIVALS["one"]}, ModelError, "at least two models .* got dict of 1"),
+        (RIVALS["one"], ModelError, "got DataTree"),
+        (RIVALS | {"two": 3}, ModelError, r"results\['two'\] must be .* got int"),
+        (
+            RIVALS | {"two": xr.DataTree.from_dict({"smc": xr.Dataset()})},
+            ModelError,
+            "got a tempered run",
+        ),
+        (
+            RIVALS | {"two": course([[-1.0, -2.0]] * 2, ROWS[:2])},
+            DataMismatchError,
+            "3 of 'one' and 2 of 'two'",
+        ),
+        (
+            RIVALS | {"two": course([[-1.0, -2.0, -3.0]] * 2, fingerprint="ffff")},
+            DataMismatchError,
+            "got others of 'two'",
+        ),
+    ],
+)
+def test_bad_input(results, error, match):
+    with pytest.raises(error, match=match):
+        psf.plot_prequential(results, backend="none")
