@@ -44,8 +44,9 @@ class IMM(GaussianFilterBase):
     Blom and Bar-Shalom (1988), "The interacting multiple model algorithm for systems with Markovian
     switching coefficients", IEEE Transactions on Automatic Control 33, 780-783. Differences: a step
     may depend on the regime before it as well, and is then made for every pair of regimes before
-    they are merged; probabilities of regimes may depend on the other states, and are those at the
-    mean.
+    they are merged. Probabilities of regimes may depend on the other states: they are means over
+    the Gaussian, which becomes that of the state given the regime drawn, by quadrature along the
+    line on which the probability changes at the mean. A probability that jumps is that at the mean.
 
     The error is small where an observation tells the regime soon, and not known beforehand:
     `check_filter` compares the filter with unbiased ones. `RBPF` is unbiased for systems that are

@@ -173,8 +173,8 @@ class RBPF(ParticleFilter):
     that ``inner`` finds for the other states given this path. Where the system is linear given the
     regimes, and their probabilities do not depend on the other states, the estimate of the
     likelihood has the exact likelihood as its mean, for any number of particles, and far less noise
-    than that of `BootstrapPF`. Otherwise it has the error of ``inner``, or that of probabilities at
-    the mean of the other states.
+    than that of `BootstrapPF`. Otherwise it has the error of ``inner``, or that of probabilities of
+    regimes given a Gaussian state, see `IMM`.
 
     Parameters
     ----------

@@ -10,9 +10,8 @@ then the probability of each regime; then mean and covariance of the continuous 
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 import pytensor.tensor as pt
@@ -33,14 +32,8 @@ from ..gaussian.linearization import (
     unpack,
     update,
 )
+from .draws import Weighted, draws_of, total_of
 from .hybrid import Hybrid, hybrid_of
-
-
-class Weighted(NamedTuple):
-    """A probability, which need not be normalised, and a vector (mean, covariance)."""
-
-    weight: TensorVariable
-    state: TensorVariable
 
 
 def merged(parts: Sequence[Weighted], n: int) -> Weighted:
@@ -50,7 +43,7 @@ def merged(parts: Sequence[Weighted], n: int) -> Weighted:
     """
     if len(parts) == 1:
         return parts[0]
-    total = pt.add(*(part.weight for part in parts))
+    total = total_of([part.weight for part in parts])
     is_possible = pt.neq(total, 0.0)
     divisor = pt.switch(is_possible, total, 1.0)
     shares = [pt.switch(is_possible, part.weight / divisor, 1 / len(parts)) for part in parts]
@@ -138,27 +131,36 @@ class _Mixture:
 
     def _predict(self, before: Sequence[Weighted]) -> list[Weighted]:
         """One step of every regime, by every way that there is."""
-        found = defaultdict(list)
-        for v, regime, origins in self._ways():
-            leaving = [self._leaving(before[origin], origin, v) for origin in origins]
+        found, leaving = defaultdict(list), self._leaving(before)
+        for (*v, regime), moves in self._ways().items():
+            parts = [leaving[move] for move in moves]
+            origins = [int(self.hybrid.found.step.origin[move]) for move in moves]
             if self.hybrid.step_forgets_regime:
-                leaving, origins = [merged(leaving, self.hybrid.n)], origins[:1]
-            for part, origin in zip(leaving, origins, strict=True):
-                found[regime].append(self._moved(part, origin, v))
+                parts, origins = [merged(parts, self.hybrid.n)], origins[:1]
+            for part, origin in zip(parts, origins, strict=True):
+                found[int(regime)].append(self._moved(part, origin, pt.constant(np.array(v))))
         return self._collected(found)
 
-    def _ways(self) -> Iterable[tuple[TensorVariable, int, list[int]]]:
-        """What the finite variables may be, the regime this leads to, and those it leads from."""
+    def _ways(self) -> Mapping[tuple[float, ...], list[int]]:
+        """The moves with the same values of the finite variables, to the same regime."""
         step, ways = self.hybrid.found.step, defaultdict(list)
-        for origin, v, regime in zip(step.origin, step.values, step.successor, strict=True):
-            ways[*v, regime].append(int(origin))
-        return ((pt.constant(np.array(v)), int(r), o) for (*v, r), o in ways.items())
+        for move, (v, regime) in enumerate(zip(step.values, step.successor, strict=True)):
+            ways[*v, regime].append(move)
+        return ways
 
-    def _leaving(self, part: Weighted, origin: int, v: TensorVariable) -> Weighted:
-        """What of a regime takes a way; a probability is that at the mean of the state."""
-        regime = pt.constant(self.hybrid.regimes[origin])
-        step = self.hybrid.step(self.values, regime, part.state[: self.hybrid.n], v)
-        return Weighted(part.weight * step.drawn.probability, part.state)
+    def _leaving(self, before: Sequence[Weighted]) -> dict[int, Weighted]:
+        """What of its regime takes each of the moves."""
+        step, found = self.hybrid.found.step, {}
+        for origin, part in enumerate(before):
+            moves = np.flatnonzero(step.origin == origin)
+            regime, drawn = (
+                self.hybrid.regimes[origin],
+                [pt.constant(v) for v in step.values[moves]],
+            )
+            parts = draws_of(self.hybrid, self.values, pt.constant(regime), part.state, drawn)
+            for move, (weight, state) in zip(moves.tolist(), parts, strict=True):
+                found[move] = Weighted(part.weight * weight, state)
+        return found
 
     def _moved(self, part: Weighted, origin: int, v: TensorVariable) -> Weighted:
         state = graph_replace(self._predicted, self._known(part.state, origin, v), strict=False)
@@ -196,6 +198,6 @@ class _Mixture:
             part.weight * pt.exp(pt.minimum(term - largest, 0.0))
             for part, term in zip(before, terms, strict=True)
         ]
-        total = joint[0] if len(joint) == 1 else pt.add(*joint)
+        total = total_of(joint)
         after = [Weighted(w / total, state) for w, state in zip(joint, analyses, strict=True)]
         return after, largest + pt.log(total)

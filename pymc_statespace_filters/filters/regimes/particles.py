@@ -30,6 +30,7 @@ from ..gaussian.linearization import (
     state_size,
     update,
 )
+from .draws import draws_of, total_of
 from .hybrid import Hybrid, Symbols, hybrid_of
 
 
@@ -136,11 +137,18 @@ class _Equations:
     def step(self) -> TensorVariable:
         """The particle after a step."""
         regime, state = self.parts(self.particle)
-        mean, drawn = state[: self.hybrid.n], [pt.constant(v) for v in self.hybrid.drawn]
-        weights = [self.hybrid.step(self.values, regime, mean, v).drawn.probability for v in drawn]
-        v = self._chosen(weights, drawn)
+        drawn = [pt.constant(v) for v in self.hybrid.drawn]
+        parts = draws_of(self.hybrid, self.values, regime, state, drawn)
+        both = [pt.concatenate([v, part.state]) for v, part in zip(drawn, parts, strict=True)]
+        chosen = self._chosen([part.weight for part in parts], both)
+        v, state = chosen[: drawn[0].type.shape[0]], chosen[drawn[0].type.shape[0] :]
         moved = self.predicted(self.values, regime, state, v)
-        return pt.concatenate([self.hybrid.step(self.values, regime, mean, v).regime, moved])
+        return pt.concatenate([self._next_regime(regime, state, v), moved])
+
+    def _next_regime(
+        self, regime: TensorVariable, state: TensorVariable, v: TensorVariable
+    ) -> TensorVariable:
+        return self.hybrid.step(self.values, regime, state[: self.hybrid.n], v).regime
 
     def moved_to_observation(self, later: Symbols) -> TensorVariable:
         """The particle after a step and an observation, and the log-density of the latter.
@@ -149,19 +157,21 @@ class _Equations:
         """
         regime, state = self.parts(self.particle)
         weights, terms, particles = [], [], []
-        for v in map(pt.constant, self.hybrid.drawn):
-            step = self.hybrid.step(self.values, regime, state[: self.hybrid.n], v)
-            forecast = self.predicted(self.values, regime, state, v)
-            analysis, term = self.updated(later, step.regime, forecast)
-            weights.append(step.drawn.probability)
-            terms.append(pt.switch(pt.eq(step.drawn.probability, 0.0), -np.inf, term))
-            particles.append(pt.concatenate([step.regime, analysis]))
+        drawn = [pt.constant(v) for v in self.hybrid.drawn]
+        parts = draws_of(self.hybrid, self.values, regime, state, drawn)
+        for v, (weight, given) in zip(drawn, parts, strict=True):
+            regime_after = self._next_regime(regime, given, v)
+            forecast = self.predicted(self.values, regime, given, v)
+            analysis, term = self.updated(later, regime_after, forecast)
+            weights.append(weight)
+            terms.append(pt.switch(pt.eq(weight, 0.0), -np.inf, term))
+            particles.append(pt.concatenate([regime_after, analysis]))
         largest = pt.max(pt.stack(terms))
         joint = [
             pt.switch(pt.eq(w, 0.0), 0.0, w * pt.exp(term - largest))
             for w, term in zip(weights, terms, strict=True)
         ]
-        log_density = largest + pt.log(_sum(joint))
+        log_density = largest + pt.log(total_of(joint))
         return pt.concatenate([self._chosen(joint, particles), [log_density]])
 
     def start(self) -> TensorVariable:
@@ -175,7 +185,7 @@ class _Equations:
         self, weights: Sequence[TensorVariable], vectors: Sequence[TensorVariable]
     ) -> TensorVariable:
         """The vector on whose share of the weights the normal falls; NaN where a weight is."""
-        total, below, chosen = _sum(weights), weights[0], vectors[0]
+        total, below, chosen = total_of(weights), weights[0], vectors[0]
         place = normal_probability(self.z[0]) * total
         for i, vector in enumerate(vectors[1:], start=1):
             chosen = pt.switch(place >= below, vector, chosen)
@@ -212,7 +222,3 @@ class _Equations:
             n_inputs=len(columns), carried=(), accumulators=(), discrete_noise=False,
             gaussian_observation=False, keeps_noises=True, equations=equations,
         )  # fmt: skip
-
-
-def _sum(numbers: Sequence[TensorVariable]) -> TensorVariable:
-    return numbers[0] if len(numbers) == 1 else pt.add(*numbers)
