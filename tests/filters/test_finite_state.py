@@ -9,8 +9,10 @@ import pytest
 from scipy.stats import norm, poisson
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.outcomes import Failure
+from pymc_statespace_filters.filters.recommendation import exact_filter
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.ops.states import Predictions, States
@@ -325,3 +327,27 @@ def test_values_are_checked():
     terms = psf.log_likelihood(SWITCH, declared, GIVEN, **RECORD)
     plain = psf.log_likelihood(SWITCH, psf.FiniteStateFilter(), GIVEN, **RECORD)
     np.testing.assert_array_equal(terms, plain)
+
+
+def test_a_choice_between_values_of_the_state_is_no_kink():
+    """A choice by a parameter is one: NUTS is chosen by it."""
+    filter = psf.FiniteStateFilter()
+    assert filter.is_smooth_for(compile_system(SWITCH))
+    assert filter.is_smooth_for(compile_system(WEAR))
+    kinked = psf.StateSpaceModel(
+        transition=lambda x, q: [q[0]],
+        process_dist=lambda x, p: [pm.Bernoulli.dist(pt.minimum(p, 0.5))],
+        observation=lambda x: [x[0]],
+        observation_noise=[[1.0]],
+        initial_mean=[0.0],
+        initial_cov=[[0.0]],
+    )
+    assert not filter.is_smooth_for(compile_system(kinked))
+
+
+def test_it_is_recommended_where_another_filter_refuses():
+    """As an exact one, and `check_filter` takes it as its witness."""
+    with pytest.raises(ModelError, match=r"FiniteStateFilter\(\)"):
+        psf.log_likelihood(WEAR, psf.GridFilter(), WORN, **COUNTS)
+    found = exact_filter(compile_system(WEAR), without=psf.BootstrapPF(100))
+    assert found == psf.FiniteStateFilter()
