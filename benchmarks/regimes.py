@@ -69,12 +69,12 @@ def main():
             began = time.process_time()
             found = _log_likelihoods(system, filter, observed, np.arange(N_SEEDS))
             seconds = (time.process_time() - began) / N_SEEDS
-            rows.append((filter, found.mean() - exact, found.std(), 1e3 * seconds))
+            rows.append((str(filter), found.mean() - exact, found.std(), 1e3 * seconds))
         plain = rows[-1][2] ** 2 * rows[-1][3]
         print(f"sensor of standard deviation {sensor}; exact to {many.std() / 10**0.5:.3f}")
         for filter, bias, sd, ms in rows:
-            ratio = f"1/{plain / (sd**2 * ms):.0f}" if sd else "-"
-            print(f"{filter!s:75} {bias:+8.3f} +- {sd:6.3f} {ms:7.2f} ms  {ratio}")
+            ratio = f"{ms:.2f} ms, 1/{plain / (sd**2 * ms):.0f}" if sd > 1e-9 else "without noise"
+            print(f"{filter} | {bias:+.3f} +- {sd:.3f} | {ratio}")
 
 
 if __name__ == "__main__":

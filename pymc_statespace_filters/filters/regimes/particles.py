@@ -219,6 +219,6 @@ class _Equations:
         )
         return model._with(
             n=n, m=1, r=0, states=tuple(f"particle {i}" for i in range(n)), inputs=columns,
-            n_inputs=len(columns), carried=(), accumulators=(), discrete_noise=False,
+            n_inputs=len(columns), carried=(), accumulators=(), drifting=(), discrete_noise=False,
             gaussian_observation=False, keeps_noises=True, equations=equations,
         )  # fmt: skip
