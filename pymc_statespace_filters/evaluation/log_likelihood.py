@@ -49,7 +49,7 @@ def log_likelihood(
     Parameters
     ----------
     system : StateSpaceModel
-    filter : EKF, UKF, IPLF, EnKF, BootstrapPF, GuidedPF, PFEnKF or GridFilter
+    filter : a filter of the package, such as EKF, GuidedPF, IMM or FiniteStateFilter
     params : mapping
         Parameter values by name; arrays broadcast to a shape S (a declared parameter's own shape
         comes last).

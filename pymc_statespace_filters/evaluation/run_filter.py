@@ -52,7 +52,7 @@ def run_filter(
     Parameters
     ----------
     system : StateSpaceModel
-    filter : EKF, UKF, IPLF, EnKF, BootstrapPF, GuidedPF, PFEnKF or GridFilter
+    filter : a filter of the package, such as EKF, GuidedPF, IMM or FiniteStateFilter
     params : mapping
         A value for every parameter; in a panel of G records, one for all or one for each.
     observed, steps, times, panel, inputs, t0, unit, input_times, inputs_at

@@ -41,7 +41,7 @@ class StateSpace(Continuous):
         Name of the variable.
     system : StateSpaceModel
         The equations.
-    filter : EKF, UKF, IPLF, EnKF, BootstrapPF, GuidedPF, PFEnKF or GridFilter
+    filter : a filter of the package, such as EKF, GuidedPF, IMM or FiniteStateFilter
         The filter that computes the likelihood.
     params : mapping, optional
         Parameters by name, numbers or expressions. A parameter not named here is the variable of

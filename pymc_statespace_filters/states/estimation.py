@@ -38,7 +38,7 @@ def filtered_states(
         The model of the draws; by default that of the ``with`` block.
     var_name : str, optional
         Name of a StateSpace variable; all of them by default.
-    filter : EKF, UKF, IPLF, EnKF, BootstrapPF, GuidedPF, PFEnKF or GridFilter, optional
+    filter : a filter of the package, such as EKF, GuidedPF, IMM or FiniteStateFilter, optional
         A filter to use instead of that of the variable.
     at : {"observations", "steps"}
         Times of the states: those of the observations, or every step from 0 to the last
