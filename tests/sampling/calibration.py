@@ -181,7 +181,7 @@ class Replications:
         with pm.Model() as self.model:
             problem.prior()
             psf.StateSpace("d", LINEAR, setting.filter, observed=self.record, **problem.rows)
-        self._kernel = settings = RandomWalkSettings(**setting.dram)
+        self.kernel = settings = RandomWalkSettings(**setting.dram)
         if setting.graph:
             self._target = Target(self.model, None, settings, graph=setting.graph(self.model))
         else:
@@ -198,7 +198,7 @@ class Replications:
     def chain(self, index, n_draws):
         """Draws (n_draws, ...) by name: those of ``sample_dram(random_seed=index, chains=1)``."""
         request = RunArguments(
-            draws=n_draws, tune=TUNE, chains=1, random_seed=index, kernel=self._kernel
+            draws=n_draws, tune=TUNE, chains=1, random_seed=index, kernel=self.kernel
         ).request()
         task = ModelTask(self.model, request, target=self._target)
         with self._lock:
@@ -211,7 +211,7 @@ class Replications:
         chain.run(Event())
         task.add_result(0, *chain.result())
         while task.extend():
-            chain.extend(task.n_iterations, task.mixture)
+            chain.extend(task.n_iterations, task.thin, task.mixture)
             chain.run(Event())
             task.add_result(0, *chain.result())
         with self._lock:

@@ -24,9 +24,8 @@ THRESHOLD = 0.001 / sum(2 * len(s.problem.quantities) for s in SETTINGS.values()
 
 FOUND = 0.001  # of a sampler that is wrong, by the most telling of all its tests
 
-pytestmark = pytest.mark.slow
 
-
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SETTINGS)
 def test_ranks_are_uniform(name):
     found = calibrate(SETTINGS[name])
@@ -34,16 +33,21 @@ def test_ranks_are_uniform(name):
     assert found.lags.mean(axis=0).max() < 0.1  # so that the law of the ranks is the uniform one
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CONTROLS)
 def test_the_same_comparisons_find(name):
     assert p_values(calibrate(CONTROLS[name]).ranks).min() < FOUND
 
 
-@pytest.mark.parametrize("name", SETTINGS)
+QUICK, *OTHERS = SETTINGS  # that the calibration runs at all is also tested without it
+
+
+@pytest.mark.parametrize(
+    "name", [QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)]
+)
 def test_replications_are_what_sample_dram_draws(name):
-    setting = SETTINGS[name]
-    replications = Replications(setting)
-    for index in range(5):
+    replications = Replications(SETTINGS[name])
+    for index in range(2 if name == QUICK else 5):
         draws = replications.chain(index, LENGTHS[0])
         replications.record.set_value(replications.truth_and_record(index)[1])
         tree = psf.sample_dram(
@@ -53,7 +57,8 @@ def test_replications_are_what_sample_dram_draws(name):
             model=replications.model,
             random_seed=index,
             progressbar=False,
-            **setting.dram,
+            kernel=replications.kernel,
+            compute_convergence_checks=False,
         )
         for variable, values in draws.items():
             np.testing.assert_array_equal(tree["posterior"][variable][0], values)
