@@ -20,7 +20,7 @@ from .output import as_datatree
 from .request import Request, Run, checked_request
 from .sequential_output import finished
 from .sequential_run import Progress
-from .whole_data import tempered_run
+from .whole_data import WholeLikelihood, tempered_run
 
 _MAXIMUM = 2**32 + 1  # key of random numbers beside those of the run
 
@@ -149,10 +149,10 @@ def sample_smc(
 
 
 def _tempered(model: pm.Model, request: Request, progressbar: bool) -> xr.DataTree:
-    began = perf_counter()
+    began, likelihood = perf_counter(), WholeLikelihood(model)
     with stage_progress(1.0, enabled=progressbar) as show:
-        run = tempered_run(model, request, show)
-        maximum = _maximum(model, run, request)
+        run = tempered_run(model, likelihood, request, show)
+        maximum = _maximum(likelihood.factors, run, request)
     seconds = perf_counter() - began
     observed = observed_in(model)
     return as_datatree(
@@ -165,9 +165,8 @@ def _sequential(model: pm.Model, request: Request, progressbar: bool) -> xr.Data
     return finished(Progress.before_any_row(rows, request), request, progressbar=progressbar)
 
 
-def _maximum(model: pm.Model, run: Run, request: Request) -> float:
+def _maximum(factors: ModelFactors, run: Run, request: Request) -> float:
     """The largest log-likelihood found by a search from the particles."""
-    factors = ModelFactors(model)
     particles, shape = run.cloud.others.particles, run.cloud.others.log_weights.shape
 
     def evaluate(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -16,27 +16,35 @@ Array = NDArray[np.float64]
 
 
 class WholeLikelihood:
-    """The likelihood of a model, Potentials included, as one factor after the prior."""
+    """The likelihood of a model, Potentials included, as one factor after the prior.
+
+    ``factors`` evaluate both.
+    """
 
     def __init__(self, model: pm.Model) -> None:
-        self._factors = ModelFactors(model)
+        self.factors = ModelFactors(model)
 
     def draw(self, count: int, rng: np.random.Generator) -> Particles:
         """Draws of the prior."""
-        return self.evaluate(self._factors.prior.sample(count, rng), rng)
+        return self.evaluate(self.factors.prior.sample(count, rng), rng)
 
     def evaluate(self, x: Array, rng: np.random.Generator) -> Particles:
         """Particles at points, a noisy likelihood estimated with fresh noise at each of them."""
-        density = self._factors.density
+        density = self.factors.density
         seeds = rng.integers(np.iinfo(np.int64).max, size=(len(x), len(density.seed_names)))
-        log_prior, log_likelihood = self._factors.evaluate_with(x, seeds)
+        log_prior, log_likelihood = self.factors.evaluate_with(x, seeds)
         none = np.empty((len(x), 0))
         return Particles(x, log_prior, np.zeros(len(x)), log_likelihood, seeds, none)
 
 
-def tempered_run(model: pm.Model, request: Request, show: Callable[[float, str], None]) -> Run:
+def tempered_run(
+    model: pm.Model,
+    likelihood: WholeLikelihood,
+    request: Request,
+    show: Callable[[float, str], None],
+) -> Run:
     """Lead draws of the prior to the posterior."""
-    likelihood, rng = WholeLikelihood(model), request.generator(0)
+    rng = request.generator(0)
     cloud = request.cloud(likelihood.draw(request.n_particles, rng))
     check_alive(model, cloud)
 

@@ -101,7 +101,8 @@ def status_of(table: np.ndarray) -> int:
 
 
 @njit_internal
-def _words_at(address, count):
+def words_at(address, count):
+    """The words at an address."""
     return carray(pointer(address), (count,), np.int64)
 
 
@@ -114,17 +115,17 @@ def _numbers_at(address, count):
 def _copy_words(words, place, count):
     """Make the copies at a place of the table; the place behind them."""
     for _ in range(count):
-        _words_at(words[place + 1], 1)[0] = _words_at(words[place], 1)[0]
+        words_at(words[place + 1], 1)[0] = words_at(words[place], 1)[0]
         place += 2
     return place
 
 
 @njit_internal
-def _call_plan(plan, record):
+def call_plan(plan, record):
     """Call a filter, or what replaces it; its status."""
     request = record + WORD * N_RECORD
-    replacement = _words_at(request, N_REQUEST)[REQUEST.replacement]
-    function = replacement if replacement else _words_at(plan, HEADER.run + 1)[HEADER.run]
+    replacement = words_at(request, N_REQUEST)[REQUEST.replacement]
+    function = replacement if replacement else words_at(plan, HEADER.run + 1)[HEADER.run]
     return call_for_status(function, (plan, record, request, request + WORD * N_REQUEST))
 
 
@@ -146,7 +147,7 @@ def _run(table, out):
     for _ in range(n_calls):
         if words[place + 2] != 0:
             _copy_words(words, place + 2, 1)
-        status = _call_plan(words[place], words[place + 1])
+        status = call_plan(words[place], words[place + 1])
         if status:
             words[_HEAD.status] = status
             carray(out, (1,))[0] = 1.0

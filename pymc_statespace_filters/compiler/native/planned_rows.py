@@ -5,19 +5,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numba import carray
 
-from .composed_call import WORD, Copy
-from .entry_point import F64_PTR, I64_PTR, EntryPoint, call_for_status, pointer
-from .jit import njit_internal
-from .plan import HEADER, N_RECORD, N_REQUEST
+from .composed_call import WORD, Copy, call_plan, words_at
+from .entry_point import F64_PTR, I64_PTR, EntryPoint, pointer
 from .planned_function import BoundCall, PlannedFunction
 from .pytensor_function import Call
 
 _N_HEAD = 5  # adapter, plan, record, number of copies, number of results
-
-
-@njit_internal
-def _words_at(address, count):
-    return carray(pointer(address), (count,), np.int64)
 
 
 def _run(table, out):
@@ -27,11 +20,9 @@ def _run(table, out):
     words = carray(table, (_N_HEAD + 2 * n_copies + 2 * n_results,))
     place = _N_HEAD
     for _ in range(n_copies):
-        _words_at(words[place + 1], 1)[0] = _words_at(words[place], 1)[0]
+        words_at(words[place + 1], 1)[0] = words_at(words[place], 1)[0]
         place += 2
-    request = record + WORD * N_RECORD
-    run = _words_at(plan, HEADER.run + 1)[HEADER.run]
-    status = call_for_status(run, (plan, record, request, request + WORD * N_REQUEST))
+    status = call_plan(plan, record)
     size = 1
     for i in range(n_results):
         size += words[place + 2 * i + 1]

@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...importance import systematic
 from ...smc.temperature import next_temperature
 
 _ESS_FRACTION = 0.5  # left by a step of the temperature
@@ -61,7 +62,7 @@ def anneal(
         raised = next_temperature(temperature, log_ratio, _ESS_FRACTION)
         weights = np.exp((raised - temperature) * (log_ratio - log_ratio.max()))
         temperature = raised
-        population = population.at(_systematic(weights, n, rng))
+        population = population.at(systematic(weights, n, rng))
         sweeps = []
         for _ in range(1 if temperature < 1.0 else N_SWEEPS):
             for _ in range(_MOVES):
@@ -69,13 +70,6 @@ def anneal(
                 scale = float(np.clip(scale * math.exp(rate - _ACCEPTANCE), *_SCALES))
             sweeps.append(population)
     return Population(*(np.concatenate(parts) for parts in zip(*sweeps, strict=True)))
-
-
-def _systematic(weights: Array, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Indices of ``n`` points by systematic resampling."""
-    ends = np.cumsum(weights)
-    places = (rng.random() + np.arange(n)) * (ends[-1] / n)
-    return np.minimum(np.searchsorted(ends, places, side="right"), weights.size - 1)
 
 
 def _moved(
