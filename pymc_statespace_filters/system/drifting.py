@@ -53,7 +53,10 @@ def drifting(system: "StateSpaceModel", /, **processes: DriftProcess) -> "StateS
 
     Notes
     -----
-    A particle is then a path of the parameters too; a Gaussian filter has a mean and a covariance
+    The sigma points of `UKF` and `IPLF` depend on the number of states, so that with a strength of
+    zero their approximation of a nonlinear system may differ from that without drift.
+
+    A particle is a path of the parameters too; a Gaussian filter has a mean and a covariance
     of them on their scales. Moments that are reported in a parameter's units are those of a normal
     law on its scale, which is exact for Gaussian filters; draws are exact for all.
 
