@@ -89,6 +89,7 @@ GROUPS = {
         "compare_evidence",
         "average_models",
         "prior_sensitivity",
+        "drift_evidence",
         "step_error",
         "reweight",
         "chib_jeliazkov",

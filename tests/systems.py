@@ -121,6 +121,18 @@ def autoregression(
     return psf.StateSpaceModel(**settings | changes)
 
 
+def wandering_mean():
+    """A mean mu at the start that walks at random, with unit noise of the sensor."""
+    return psf.StateSpaceModel(
+        transition=lambda x, q, mu_strength: [x[0] + mu_strength * q[0]],
+        process_noise=[[1.0]],
+        observation=lambda x: [x[0]],
+        observation_noise=[[1.0]],
+        initial_mean=lambda mu: [mu],
+        initial_cov=[[0.0]],
+    )
+
+
 def simulated(steps, random_seed, phi, spread, observation_noise=0.4):
     """A record (J,) of `autoregression`, by NumPy: importing a test file must compile nothing."""
     rng = np.random.default_rng(random_seed)

@@ -5,6 +5,7 @@ from .comparison import (
     compare_evidence,
     prior_sensitivity,
 )
+from .drift import drift_evidence
 from .estimation import EvidenceEstimates, chib_jeliazkov, estimate_evidence
 from .evidence import Evidence
 from .reweighting import reweight
@@ -16,6 +17,7 @@ __all__ = [
     "average_models",
     "chib_jeliazkov",
     "compare_evidence",
+    "drift_evidence",
     "estimate_evidence",
     "prior_sensitivity",
     "reweight",

@@ -177,6 +177,17 @@ def build_posterior(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterio
     return Posterior(draws, log_density, evaluate, not held, prior, failures), noise
 
 
+def reproducing_seeds(idata: xr.DataTree, density: ModelDensity) -> NDArray[np.int64] | None:
+    """Seeds (chain, draw, n_seeds) that reproduce the estimates of the draws; None if none do."""
+    stats = idata["sample_stats"].to_dataset() if "sample_stats" in idata.children else xr.Dataset()
+    lacking = any(f"{name}_seed" not in stats for name in density.seed_names)
+    if lacking or density.moved or _has_seeds_of_records(stats, density):
+        return None
+    posterior = idata["posterior"]
+    shape = posterior.sizes["chain"], posterior.sizes["draw"]
+    return _stored_seeds(stats, density, shape)
+
+
 def _stored_seeds(
     stats: xr.Dataset, density: ModelDensity, shape: tuple[int, int]
 ) -> NDArray[np.int64]:

@@ -26,9 +26,10 @@ def plot_prior_sensitivity(
     Parameters
     ----------
     curves : xarray.Dataset
-        The result of `prior_sensitivity`. The label of the axis names the priors that were left
-        out, or because of which the panel is empty. A curve has no points where the draws do not
-        determine the result; an empty panel tells why.
+        The result of `prior_sensitivity`, or the attribute ``widths`` of that of `drift_evidence`.
+        The label of the axis names the priors that were left out, or because of which the panel is
+        empty. A curve has no points where the draws do not determine the result; an empty panel
+        tells why.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
         Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
@@ -62,7 +63,10 @@ def plot_prior_sensitivity(
     >>> collection.savefig("sensitivity.png")  # doctest: +SKIP
     """
     if not (isinstance(curves, xr.Dataset) and {"width_prob", *ENDS} <= set(curves)):
-        raise ModelError(f"curves must be the result of prior_sensitivity, got {curves!r}")
+        raise ModelError(
+            "curves must be the result of prior_sensitivity, or the widths of that of "
+            f"drift_evidence, got {curves!r}"
+        )
     # Not every backend of arviz_plots has a logarithmic axis.
     found = curves.assign_coords(width=np.log10(curves["width"]))
     probs = found[["width_prob"]]

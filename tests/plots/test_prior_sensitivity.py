@@ -117,5 +117,5 @@ def test_evidences_without_errors_leave_curves_without_bands():
 
 def test_what_is_refused(table):
     for given in (xr.Dataset(), None, table):
-        with pytest.raises(ModelError, match="curves must be the result of prior_sensitivity, got"):
+        with pytest.raises(ModelError, match="curves must be the result of prior_sensitivity"):
             plot_prior_sensitivity(given)

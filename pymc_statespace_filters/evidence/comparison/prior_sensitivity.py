@@ -113,7 +113,7 @@ def prior_sensitivity(
     check_ci_prob(ci_prob)
     table = compare_evidence(evidences, model_prior=model_prior, estimator=estimator)
     table = table.loc[list(evidences)]
-    factors = _factors(widths)
+    factors = width_factors(widths)
     curves = _width_curves(evidences, models, var_names, factors)
     if curves.left_out:
         warnings.warn(curves.note, EvidenceWarning, stacklevel=3)
@@ -158,7 +158,8 @@ def _over_widths(
     )
 
 
-def _factors(widths: ArrayLike | None) -> Array:
+def width_factors(widths: ArrayLike | None) -> Array:
+    """Check the widths of priors; by default those of `WIDTHS`."""
     if widths is None:
         return WIDTHS
     try:

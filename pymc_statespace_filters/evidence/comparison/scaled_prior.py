@@ -93,6 +93,10 @@ class ScaledPrior:
 
     def reweighted(self, posterior: xr.Dataset, width: float) -> ReweightedEvidence:
         """Compute the evidence under priors scaled by ``width``, from draws of all variables."""
+        return average_ratios(*self.log_ratios(posterior, width))
+
+    def log_ratios(self, posterior: xr.Dataset, width: float) -> tuple[Array, Array]:
+        """Log-ratios p_w / p of draws (chain, draw), and their `_beyond`."""
         shape = posterior.sizes["chain"], posterior.sizes["draw"]
         rows = [
             np.concatenate(posterior[name].transpose("chain", "draw", ...).values).astype(dtype)
@@ -100,7 +104,7 @@ class ScaledPrior:
         ]
         with np.errstate(all="ignore"):  # a narrow prior may be zero at a draw
             log_ratio, beyond = self._function(width, *rows)
-        return average_ratios(log_ratio.reshape(shape), beyond)
+        return log_ratio.reshape(shape), beyond
 
 
 def average_ratios(log_ratio: Array, beyond: Array) -> ReweightedEvidence:
@@ -133,7 +137,7 @@ def _log_ratio(
     rv: TensorVariable, value: TensorVariable, width: TensorVariable, size: int
 ) -> tuple[TensorVariable, TensorVariable]:
     """Log-ratio of the scaled and original density of one variable, and `_beyond`."""
-    lower, upper = _bounds(rv)
+    lower, upper = bounds_of_support(rv)
     on_left = pt.eq(lower, 0) | (pt.isfinite(lower) & pt.isinf(upper))
     on_right = pt.eq(upper, 0) | (pt.isfinite(upper) & pt.isinf(lower))
     centre = pt.switch(on_left, lower, pt.switch(on_right, upper, support_point(rv)))
@@ -142,7 +146,7 @@ def _log_ratio(
     return scaled - pm.logp(rv, value).sum(), beyond
 
 
-def _bounds(rv: TensorVariable) -> tuple[TensorVariable, TensorVariable]:
+def bounds_of_support(rv: TensorVariable) -> tuple[TensorVariable, TensorVariable]:
     """Ends of the support, which may be infinite."""
     support = _default_transform(rv.owner.op, rv)
     ends: tuple[TensorVariable | None, TensorVariable | None] = (None, None)

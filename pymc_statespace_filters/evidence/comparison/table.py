@@ -16,7 +16,7 @@ class EvidenceTable(SentenceTable):
     main_columns = ("prob", "prob_low", "prob_high", "log_evidence", "se", "step_error")
 
     def _texts(self, name: str) -> list[str]:
-        if name in ("log_evidence", "se", "step_error"):
+        if name in ("log_evidence", "log_bayes_factor", "se", "step_error"):
             decimals = _decimals(self["se"]) if "se" in self else FEWEST_DECIMALS
             return [_fixed(value, decimals) for value in self[name]]
         return [_probability(value) for value in self[name]]

@@ -1,0 +1,154 @@
+r"""The evidence of a constant model over that of the drifting one, from draws of the latter.
+
+With strengths s, all other parameters r and any proper density w,
+
+.. math::
+
+    \frac{Z_0}{Z_1} = E\left[\frac{w(s | r)\, p_0(r)\, L(0, r)}{p(s, r)\, L(s, r)}\right],
+
+where the mean is over the posterior of the drifting model and :math:`p_0` is the prior of the
+constant one. This is the importance-weighted marginal density estimate of p(0 | D) over p(0)
+(Chen 1994), and holds whatever the prior density at zero is. The terms vary least if w is the
+posterior density of s given r.
+
+It holds with unbiased estimates of the likelihood, too: the denominator is the estimate by which
+the chain accepted the draw. If a noise seed reproduces it, the numerator has the same noise, as the
+noise of a posterior draw has the density m(v) L(s, r, v) / L(s, r); otherwise it has fresh noise.
+
+Difference from the source: the terms are taken at r' = r + b(0) - b(s) in place of r in the
+numerator, where b(s) is a regression of the draws of r on s. For each s that is a translation, of
+which the integral over r does not depend; r' is nearer to where the constant model has its
+posterior.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pymc as pm
+from numpy.typing import NDArray
+
+from ...compiler.native.compilation import warning_filter
+from ...pymc_model.density import ModelDensity
+from ..posterior import Posterior
+from .conditional import ConditionalStrength, fit_conditional
+from .strengths import Strengths, StrengthsAtPoints
+
+MOST_SQUARES = 9.0  # mean squares of a strength, beyond which the others are not translated further
+
+Array = NDArray[np.float64]
+
+
+class ConstantModel:
+    """The model with some strengths at zero, as ``pm.do`` makes it.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The strengths.
+    density : ModelDensity
+        Of its other parameters.
+    """
+
+    def __init__(self, model: pm.Model, names: Sequence[str], *, moved: bool) -> None:
+        self.names = tuple(names)
+        shapes = model.eval_rv_shapes()
+        zeros = {name: np.zeros(tuple(map(int, shapes[name]))) for name in names}
+        constant = pm.do(model, zeros)
+        # A prior of the strengths' own parameters reaches no data now.
+        with warning_filter("ignore", "the prior of .* reaches no likelihood"):
+            self.density = ModelDensity(constant, moved=moved)
+        self._strengths = StrengthsAtPoints(model, names)
+        self._others = _columns(model, [rv.name for rv in constant.free_RVs])
+
+    def log_terms(
+        self, posterior: Posterior, seeds: NDArray[np.int64] | None, rng: np.random.Generator
+    ) -> Array:
+        """Logs of the averaged terms, (chain, draw); w and b are those of the other half chains.
+
+        ``seeds`` (chain, draw, n_seeds) are those of the estimates of the draws, if known.
+        """
+        log_terms = np.empty(posterior.log_density.shape)
+        middle = log_terms.shape[1] // 2
+        halves = slice(None, middle), slice(middle, None)
+        for fitted, averaged in (halves, halves[::-1]):
+            x, at = (_flat(posterior.draws[:, part]) for part in (fitted, averaged))
+            fit = fit_conditionals(self._strengths(x), x[:, self._others])
+            strengths, others = self._strengths(at), at[:, self._others]
+            others = fit.translated(strengths.sizes, others)
+            own = self._seeds(len(at), None if seeds is None else _flat(seeds[:, averaged]), rng)
+            found = fit.log_density(strengths, others) + self.density.evaluate(others, own)
+            found -= posterior.log_density[:, averaged].ravel()
+            log_terms[:, averaged] = found.reshape(log_terms[:, averaged].shape)
+        return log_terms
+
+    def _seeds(
+        self, n: int, seeds: NDArray[np.int64] | None, rng: np.random.Generator
+    ) -> NDArray[np.int64]:
+        size = (n, len(self.density.seed_names))
+        return rng.integers(np.iinfo(np.int64).max, size=size) if seeds is None else seeds
+
+
+@dataclass(frozen=True)
+class FittedConditionals:
+    """The density w of several strengths given the other parameters, one after the other.
+
+    ``translation`` (2 d, k) are the coefficients of b, ``scale`` (d,) roots of the mean squares.
+    """
+
+    conditionals: tuple[ConditionalStrength, ...]
+    translation: Array
+    scale: Array
+
+    def translated(self, sizes: Array, others: Array) -> Array:
+        """The other parameters (n, k) at strengths (n, d), moved to where they are at zero."""
+        return np.asarray(others - _powers(sizes, self.scale) @ self.translation)
+
+    def log_density(self, strengths: Strengths, others: Array) -> Array:
+        """Log of w by the unconstrained strengths, (n,)."""
+        given = _regressors(strengths.sizes, others)
+        sizes = strengths.sizes.T
+        each = [
+            one.log_density(s, regressors)
+            for one, s, regressors in zip(self.conditionals, sizes, given, strict=True)
+        ]
+        halved = strengths.is_signed.sum() * np.log(2)
+        return np.asarray(np.sum(each, axis=0) - halved + strengths.log_jacobian)
+
+
+def fit_conditionals(strengths: Strengths, others: Array) -> FittedConditionals:
+    """Fit to draws of strengths (n, d) and other parameters (n, k)."""
+    sizes = strengths.sizes
+    scale = np.sqrt((sizes**2).mean(axis=0))
+    powers = _powers(sizes, scale)
+    design = np.column_stack([np.ones(len(powers)), powers])
+    translation = np.linalg.lstsq(design, others, rcond=None)[0][1:]
+    given = _regressors(sizes, others - powers @ translation)
+    fitted = map(fit_conditional, sizes.T, given, strengths.largest)
+    return FittedConditionals(tuple(fitted), translation, scale)
+
+
+def _powers(sizes: Array, scale: Array) -> Array:
+    """The regressors (n, 2 d) of b; zero at zero."""
+    square = np.minimum((sizes / scale) ** 2, MOST_SQUARES)
+    return np.column_stack([np.sqrt(square), square])
+
+
+def _regressors(sizes: Array, others: Array) -> Iterator[Array]:
+    """What each strength is given: the other parameters and the strengths before it."""
+    for i in range(sizes.shape[1]):
+        yield np.column_stack([others, sizes[:, :i]])
+
+
+def _flat(values: NDArray) -> NDArray:
+    n_chains, n_draws, n = values.shape
+    return values.reshape(n_chains * n_draws, n)
+
+
+def _columns(model: pm.Model, names: Sequence[str]) -> NDArray[np.int64]:
+    """Columns of the unconstrained vector that belong to free variables, in the order of names."""
+    point = model.initial_point()
+    sizes = [point[model.rvs_to_values[rv].name].size for rv in model.free_RVs]
+    parts = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
+    by_name = dict(zip([rv.name for rv in model.free_RVs], parts, strict=True))
+    return np.concatenate([by_name[name] for name in names])

@@ -1,0 +1,119 @@
+"""The strengths of drift among the free variables of a model, at draws on the unconstrained space.
+
+A strength is zero or positive, or of either sign if the likelihood is even in it; at zero the
+parameter is constant.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pymc as pm
+import pytensor
+import pytensor.tensor as pt
+from numpy.typing import NDArray
+from pytensor.graph.traversal import ancestors
+from pytensor.tensor.variable import TensorVariable
+
+from ...compiler.native.rows import at_points
+from ...errors import ModelError
+from ...pymc_model.prior import is_improper
+from ..comparison.scaled_prior import bounds_of_support
+
+Array = NDArray[np.float64]
+
+
+class Strengths(NamedTuple):
+    """Scalars of some free variables at n points.
+
+    ``sizes`` (n, d) are their absolute values; ``log_jacobian`` (n,) is that of the values by the
+    unconstrained vector. ``largest`` (d,) is the end of the support, and ``is_signed`` (d,) whether
+    it reaches as far below zero.
+    """
+
+    sizes: Array
+    log_jacobian: Array
+    largest: Array
+    is_signed: NDArray[np.bool_]
+
+
+def chosen_strengths(model: pm.Model, names: Iterable[str]) -> list[str]:
+    """Check that free variables can be strengths; return their names, each once."""
+    chosen = list(dict.fromkeys(names))
+    free = [rv.name for rv in model.free_RVs]
+    if unknown := [name for name in chosen if name not in free]:
+        raise ModelError(f"var_names must be free variables of the model, {free}, got {unknown}")
+    if set(chosen) == set(free):
+        raise ModelError(
+            f"model must have a free variable beside the strengths {chosen}: without one the "
+            "constant model has a likelihood and no posterior; compare it with estimate_evidence"
+        )
+    for name in chosen:
+        if is_improper(model[name], model):
+            raise ModelError(
+                f"the prior of {name!r} is improper or not normalised, and the Bayes factor is "
+                "proportional to its unknown density: give it a proper prior, such as "
+                f"pm.HalfNormal({name!r}, ...)"
+            )
+    return chosen
+
+
+class StrengthsAtPoints:
+    """The values of free variables with these names at points of the unconstrained space.
+
+    Raises
+    ------
+    ModelError
+        If zero is neither the lower end nor the middle of the support of one.
+    """
+
+    def __init__(self, model: pm.Model, names: Sequence[str]) -> None:
+        chosen = [model[name] for name in names]
+        ends = [_ends(rv, model) for rv in chosen]
+        self._largest = np.concatenate([largest for largest, _ in ends])
+        self._is_signed = np.concatenate([is_signed for _, is_signed in ends])
+        values = [model.rvs_to_values[rv] for rv in model.free_RVs]
+        point = model.initial_point()
+        self._shapes = [point[value.name].shape for value in values]
+        scalars = pt.concatenate([pt.flatten(rv) for rv in chosen])
+        jacobian = pt.sum(pt.stack([_log_jacobian(rv, model) for rv in chosen]))
+        graphs = model.replace_rvs_by_values([scalars, jacobian])
+        points, at_all = at_points(values, graphs)
+        # One call handles all draws, which is not worth machine code.
+        self._function = pytensor.function(
+            points, at_all, mode="FAST_COMPILE", on_unused_input="ignore"
+        )
+
+    def __call__(self, x: Array) -> Strengths:
+        """At points x (n, k)."""
+        sizes = [int(np.prod(shape)) for shape in self._shapes]
+        columns = np.split(x, np.cumsum(sizes)[:-1], axis=1)
+        parts = [c.reshape(len(x), *shape) for c, shape in zip(columns, self._shapes, strict=True)]
+        scalars, log_jacobian = self._function(*parts)
+        return Strengths(np.abs(scalars), log_jacobian, self._largest, self._is_signed)
+
+
+def _log_jacobian(rv: TensorVariable, model: pm.Model) -> TensorVariable:
+    transform = model.rvs_to_transforms[rv]
+    if transform is None:
+        return pt.constant(0.0)
+    return pt.sum(transform.log_jac_det(model.rvs_to_values[rv], *rv.owner.inputs))
+
+
+def _ends(rv: TensorVariable, model: pm.Model) -> tuple[Array, NDArray[np.bool_]]:
+    """The end of the support of every scalar, (d,), and whether it reaches as far below zero."""
+    bounds = bounds_of_support(rv)
+    shape = model.eval_rv_shapes()[rv.name]
+    if set(ancestors(bounds)) & set(model.basic_RVs):
+        raise ModelError(f"the support of {rv.name!r} must not depend on other variables")
+    lower, upper = (
+        np.broadcast_to(bound.eval(mode="FAST_COMPILE"), shape).astype(float).ravel()
+        for bound in bounds
+    )
+    is_signed = lower == -upper
+    if not (is_signed | (lower == 0)).all():
+        raise ModelError(
+            f"the support of {rv.name!r} must begin at zero, where the parameter is constant, or "
+            f"be symmetric about it, got {lower.min():g} to {upper.max():g}"
+        )
+    return upper, is_signed

@@ -1,0 +1,42 @@
+"""The table of `drift_evidence`."""
+
+from collections.abc import Iterator
+from typing import Any, ClassVar, Self
+
+import pandas as pd
+import xarray as xr
+
+from ..comparison.table import EvidenceTable
+
+
+class DriftTable(EvidenceTable):
+    """A DataFrame with a row for each strength, and the same for other widths of the priors.
+
+    Attributes
+    ----------
+    widths : xarray.Dataset
+        For `plot_prior_sensitivity`.
+    """
+
+    _metadata: ClassVar[list[str]] = ["sentences", "widths"]
+    main_columns = ("prob", "prob_low", "prob_high", "log_bayes_factor", "se")
+
+    def __init__(self, data: Any = None, *, widths: xr.Dataset, **settings: Any) -> None:
+        super().__init__(data, **settings)
+        self.widths = widths
+
+    def __copy__(self, deep: bool = False) -> Self:
+        return type(self)(self.copy(deep), widths=self.widths, sentences=self.sentences)
+
+
+def sentences(table: pd.DataFrame, others: list[str], ci_prob: float) -> Iterator[str]:
+    """What the display says below the columns; ``others`` are the other free variables."""
+    yield (
+        "prob is that of drift, against the model with the strength at zero and the same priors of "
+        f"{', '.join(others)}."
+    )
+    if open_ones := [name for name, row in table.iterrows() if row["undecided"]]:
+        yield f"Undecided at {100 * ci_prob:g} %: whether {' and '.join(open_ones)} is zero."
+    for name, row in table.iterrows():
+        if row["doubts"]:
+            yield f"{name}: {row['doubts']}."

@@ -1,0 +1,227 @@
+"""The Bayes factor for drift, against quadrature over the strength."""
+
+from functools import cache
+
+import arviz as az
+import numpy as np
+import pymc as pm
+import pytest
+from scipy.integrate import quad
+from scipy.stats import halfnorm, multivariate_normal, uniform
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.errors import EvidenceWarning, ModelError
+from pymc_statespace_filters.evidence.drift.conditional import fit_conditional
+from pymc_statespace_filters.evidence.drift.marginal import ConstantModel
+from pymc_statespace_filters.evidence.drift.strengths import StrengthsAtPoints
+from pymc_statespace_filters.evidence.posterior import build_posterior
+from pymc_statespace_filters.importance import log_mean_of_chains
+from pymc_statespace_filters.pymc_model.density import ModelDensity
+from tests.systems import wandering_mean
+
+N_ROWS, MEAN_SD, WIDTH = 12, 2.0, 0.5
+SYSTEM = wandering_mean()
+PATH_COV = np.minimum.outer(np.arange(N_ROWS), np.arange(N_ROWS))
+EXACT = psf.EKF()
+HALF_NORMAL = halfnorm(scale=WIDTH).pdf
+QUIET = {"random_seed": 1, "progressbar": False}
+
+
+def log_likelihood(observed, strength):
+    """With the mean integrated out; exact."""
+    cov = np.eye(N_ROWS) + MEAN_SD**2 + strength**2 * PATH_COV
+    return multivariate_normal(np.zeros(N_ROWS), cov).logpdf(observed)
+
+
+def record(strength, random_seed):
+    rng = np.random.default_rng(random_seed)
+    steps = strength * rng.standard_normal(N_ROWS - 1)
+    return 1 + np.concatenate([[0], np.cumsum(steps)]) + rng.standard_normal(N_ROWS)
+
+
+@cache
+def drifting_model(strength, random_seed, filter=EXACT, prior="half-normal"):
+    observed = record(strength, random_seed)
+    with pm.Model() as model:
+        pm.Normal("mu", 0, MEAN_SD)
+        priors = {
+            "half-normal": lambda: pm.HalfNormal("mu_strength", WIDTH),
+            "uniform": lambda: pm.Uniform("mu_strength", 0, WIDTH),
+            "signed": lambda: pm.Normal("mu_strength", 0, WIDTH),
+        }
+        priors[prior]()
+        psf.StateSpace("d", SYSTEM, filter, steps=range(N_ROWS), observed=observed)
+    return model, observed
+
+
+def exact_log_bayes_factor(observed, density=HALF_NORMAL, largest=8 * WIDTH):
+    shift = log_likelihood(observed, 0.0)
+    drifting = quad(
+        lambda s: density(s) * np.exp(log_likelihood(observed, s) - shift), 0, largest, limit=200
+    )
+    return np.log(drifting[0])
+
+
+def exact_draws(observed, density, largest, n=(4, 1000), random_seed=3, signed=False):
+    """Independent draws of strength and mean: by quadrature, and by conjugacy given it."""
+    rng = np.random.default_rng(random_seed)
+    grid = np.linspace(0, largest, 2001)
+    grid = (grid[1:] + grid[:-1]) / 2
+    log_post = [log_likelihood(observed, s) + np.log(density(s)) for s in grid]
+    weights = np.exp(log_post - np.max(log_post))
+    s = rng.choice(grid, size=n, p=weights / weights.sum())
+    s = np.clip(s + (rng.random(n) - 0.5) * (grid[1] - grid[0]), 1e-9, None)
+    precision, middle = np.empty(n), np.empty(n)
+    for i in np.ndindex(n):
+        solved = np.linalg.solve(
+            np.eye(N_ROWS) + s[i] ** 2 * PATH_COV, np.column_stack([np.ones(N_ROWS), observed])
+        ).sum(axis=0)
+        precision[i] = solved[0] + MEAN_SD**-2
+        middle[i] = solved[1] / precision[i]
+    mu = middle + rng.standard_normal(n) / np.sqrt(precision)
+    if signed:
+        s = s * rng.choice([-1, 1], size=n)
+    return az.from_dict({"posterior": {"mu": mu, "mu_strength": s}})
+
+
+PRIORS = {
+    "half-normal": (HALF_NORMAL, 8 * WIDTH),
+    "uniform": (uniform(0, WIDTH).pdf, WIDTH),
+    "signed": (HALF_NORMAL, 8 * WIDTH),
+}
+
+
+@pytest.mark.parametrize(
+    ("strength", "prior"), [(0.0, "half-normal"), (0.4, "uniform"), (0.4, "signed")]
+)
+def test_bayes_factor_is_that_of_quadrature(strength, prior):
+    model, observed = drifting_model(strength, 1, prior=prior)
+    density, largest = PRIORS[prior]
+    idata = exact_draws(observed, density, largest, signed=prior == "signed")
+    table = psf.drift_evidence(idata, model, var_names="mu_strength", **QUIET)
+    row = table.loc["mu_strength"]
+    exact = exact_log_bayes_factor(observed, density, largest)
+    assert row["se"] < 0.05
+    assert abs(row["log_bayes_factor"] - exact) < 3.5 * row["se"]
+    np.testing.assert_allclose(row["prob"], 1 / (1 + np.exp(-row["log_bayes_factor"])))
+    assert row["prob_low"] < row["prob"] < row["prob_high"]
+    assert not row["doubts"]
+
+
+def test_widths_are_those_of_quadrature():
+    model, observed = drifting_model(0.0, 1)
+    idata = exact_draws(observed, *PRIORS["half-normal"])
+    widths = [0.5, 1.0, 2.0]
+    found = psf.drift_evidence(idata, model, var_names=["mu_strength"], widths=widths, **QUIET)
+    curve = found.widths.sel(model="drift, mu_strength")
+    exact = [
+        exact_log_bayes_factor(observed, halfnorm(scale=w * WIDTH).pdf, 8 * w * WIDTH)
+        for w in widths
+    ]
+    error = curve["width_log_bayes_factor"] - exact
+    assert (abs(error) < 3.5 * curve["width_se"]).all()
+    assert (curve["width_se"] < 0.06).all()
+    np.testing.assert_allclose(curve["width_prob"][1], found["prob"].iloc[0])
+    psf.plot_prior_sensitivity(found.widths, backend="none")
+
+
+def test_estimates_of_the_likelihood_give_the_exact_factor():
+    model, observed = drifting_model(0.0, 1, psf.BootstrapPF(16))
+    row = psf.drift_evidence(noisy_chains(), model, var_names="mu_strength", **QUIET).iloc[0]
+    assert row["se"] < 0.1
+    assert abs(row["log_bayes_factor"] - exact_log_bayes_factor(observed)) < 3.5 * row["se"]
+
+
+def test_without_seeds_the_numerator_has_fresh_noise():
+    model, observed = drifting_model(0.0, 1, psf.BootstrapPF(16))
+    posterior, _ = build_posterior(noisy_chains(), ModelDensity(model))
+    constant = ConstantModel(model, ["mu_strength"], moved=False)
+    mean = log_mean_of_chains(constant.log_terms(posterior, None, np.random.default_rng(1)))
+    assert mean.error < 0.15
+    assert abs(-mean.value - exact_log_bayes_factor(observed)) < 3.5 * mean.error
+
+
+@cache
+def noisy_chains():
+    model, _ = drifting_model(0.0, 1, psf.BootstrapPF(16))
+    return psf.sample_dram(2000, tune=1000, model=model, **QUIET)
+
+
+def test_drift_beyond_doubt_has_no_error_and_says_what_to_do():
+    model, observed = drifting_model(5.0, 2)
+    idata = exact_draws(observed, *PRIORS["half-normal"], n=(2, 40))
+    with pytest.warns(EvidenceWarning, match=r"pm.do\(model, \{'mu_strength': 0.0\}\)"):
+        table = psf.drift_evidence(idata, model, var_names="mu_strength", **QUIET)
+    row = table.iloc[0]
+    assert np.isnan(row["se"])
+    assert row["undecided"]
+    assert row["prob"] > 0.99
+    assert np.isnan(table.widths["width_prob"]).all()
+    assert "unknown" in repr(table)
+
+
+def test_several_strengths_alone_and_together():
+    """Of independent records with drifts of their own the factors are products."""
+    system = wandering_mean()
+    records = [record(0.0, 1), record(0.4, 5)]
+    with pm.Model() as model:
+        for i, observed in enumerate(records):
+            mu = pm.Normal(f"mu{i}", 0, MEAN_SD)
+            s = pm.HalfNormal(f"s{i}", WIDTH)
+            psf.StateSpace(
+                f"d{i}", system, psf.EKF(), steps=range(N_ROWS), observed=observed,
+                params={"mu": mu, "mu_strength": s},
+            )  # fmt: skip
+    draws = {}
+    for i, observed in enumerate(records):
+        found = exact_draws(observed, *PRIORS["half-normal"], random_seed=i)["posterior"]
+        draws |= {f"mu{i}": found["mu"].values, f"s{i}": found["mu_strength"].values}
+    idata = az.from_dict({"posterior": draws})
+    table = psf.drift_evidence(idata, model, var_names=["s0", "s1"], **QUIET)
+    assert list(table.index)[2] == "s0, s1"
+    exact = [exact_log_bayes_factor(observed) for observed in records]
+    for name, value in zip(["s0", "s1", "s0, s1"], [*exact, sum(exact)], strict=True):
+        row = table.loc[name]
+        assert row["se"] < 0.07
+        assert abs(row["log_bayes_factor"] - value) < 3.5 * row["se"]
+
+
+@pytest.mark.parametrize("largest", [np.inf, 1.5])
+def test_density_of_a_strength_integrates_to_one(largest):
+    rng = np.random.default_rng(1)
+    given, s = rng.standard_normal((500, 2)), np.abs(rng.standard_normal(500))
+    fitted = fit_conditional(s[s < largest], given[s < largest], largest)
+
+    def density(s):
+        return np.exp(fitted.log_density(np.array([s]), given[:1])).item()
+
+    np.testing.assert_allclose(quad(density, 0, largest)[0], 1, rtol=1e-6)
+
+
+def test_fitted_density_of_a_strength_follows_the_other_parameters():
+    rng = np.random.default_rng(1)
+    given = rng.standard_normal((4000, 2))
+    s = np.abs(rng.standard_normal(4000)) * np.exp(0.3 * given[:, 0])
+    fitted = fit_conditional(s, given)
+    # s squared has the mean exp(0.6 z) and the distribution of a squared normal
+    np.testing.assert_allclose(fitted.coefficients, [0, 0.6, 0], atol=0.12)
+    assert fitted.shape == pytest.approx(0.5, abs=0.03)
+
+
+def test_bad_arguments():
+    model, observed = drifting_model(0.0, 1)
+    idata = exact_draws(observed, *PRIORS["half-normal"], n=(2, 50))
+    with pytest.raises(ModelError, match=r"var_names.*\['mu', 'mu_strength'\], got \['s'\]"):
+        psf.drift_evidence(idata, model, var_names="s")
+    with pytest.raises(ModelError, match="model_prior"):
+        psf.drift_evidence(idata, model, var_names="mu_strength", model_prior={"constant": 1})
+    with pm.Model() as other:
+        pm.Normal("mu", 0, 1)
+        pm.LogNormal("flat", 0, 1)
+        pm.HalfFlat("s")
+        pm.Uniform("u", 0.1, 1)
+        pm.Normal("y", 0, 1, observed=[0.0])
+    with pytest.raises(ModelError, match="prior of 's' is improper"):
+        psf.drift_evidence(idata, other, var_names="s")
+    with pytest.raises(ModelError, match="support of 'u' must begin at zero"):
+        StrengthsAtPoints(other, ["u"])
