@@ -2,6 +2,7 @@ from . import compartments, errors, mechanics
 from .diagnostics import (
     check_filter,
     compute_log_likelihood,
+    drift_scan,
     filter_diagnostics,
     leave_future_out,
 )
@@ -34,6 +35,7 @@ from .filters import (
 from .parameter_particles import extend, sample_smc
 from .plots import (
     plot_average,
+    plot_drift,
     plot_evidence,
     plot_filter_health,
     plot_forecast,
@@ -107,6 +109,7 @@ __all__ = [
     "compartments",
     "compute_log_likelihood",
     "drift_evidence",
+    "drift_scan",
     "drifting",
     "errors",
     "estimate_evidence",
@@ -123,6 +126,7 @@ __all__ = [
     "nearest_steps",
     "panel_from",
     "plot_average",
+    "plot_drift",
     "plot_evidence",
     "plot_filter_health",
     "plot_forecast",

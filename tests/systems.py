@@ -133,6 +133,33 @@ def wandering_mean():
     )
 
 
+def driven(**changes):
+    """x' = a x + gain u + q, with the noises and the mean of the start as parameters."""
+    settings = {
+        "transition": lambda x, q, u, a, gain: [a * x[0] + gain * u[0] + q[0]],
+        "process_noise": lambda sigma: [[sigma**2]],
+        "observation": lambda x: [x[0]],
+        "observation_noise": lambda sensor=0.2: [[sensor]],
+        "initial_mean": lambda start=0.0: [start],
+        "initial_cov": [[0.1]],
+        "inputs": ["force"],
+    }
+    return psf.StateSpaceModel(**settings | changes)
+
+
+def driven_by_wandering_gain():
+    """The same with a gain that walks at random from its value at the start."""
+    return driven(
+        transition=lambda x, q, u, a, strength: [
+            a * x[0] + x[1] * u[0] + q[0],
+            x[1] + strength * q[1],
+        ],
+        process_noise=lambda sigma: [[sigma**2, 0.0], [0.0, 1.0]],
+        initial_mean=lambda gain: [0.0, gain],
+        initial_cov=[[0.1, 0.0], [0.0, 0.0]],
+    )
+
+
 def simulated(steps, random_seed, phi, spread, observation_noise=0.4):
     """A record (J,) of `autoregression`, by NumPy: importing a test file must compile nothing."""
     rng = np.random.default_rng(random_seed)

@@ -3,14 +3,39 @@
 import arviz as az
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 from scipy.stats import norm
 
 from pymc_statespace_filters import average_models, compare_evidence
+from pymc_statespace_filters.diagnostics.constancy.table import DriftScan
 from pymc_statespace_filters.evidence import Evidence
 
 X = xr.DataArray(np.linspace(-2, 2, 9), coords=[("displacement", np.linspace(-2, 2, 9))])
+
+
+DRIFT_TIMES = np.arange(50) / 10
+
+
+@pytest.fixture(scope="session")
+def drift_scan():
+    """Of two parameters in one record."""
+    sums = np.stack([-np.sin(np.pi * np.arange(50) / 49), 0.1 * np.ones(50)])
+    paths = xr.Dataset(
+        {
+            "cumulated": (("parameter", "time"), sums),
+            "band": ("parameter", [0.5, 0.6]),
+            "turn": ("parameter", [25, 3]),
+        },
+        coords={"parameter": ["gain", "a"], "time": DRIFT_TIMES},
+    )
+    table = pd.DataFrame(
+        {"p_value": [0.01, 0.9], "p_alone": [0.005, 0.6], "statistic": [4.0, -0.2],
+         "time": [2.5, 0.3], "change": [0.4, -0.1]},
+        index=pd.Index(["gain", "a"], name="parameter"),
+    )  # fmt: skip
+    return DriftScan(table, paths=paths)
 
 
 @pytest.fixture(autouse=True)

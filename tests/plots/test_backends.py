@@ -8,6 +8,7 @@ from arviz_plots import PlotCollection
 
 from pymc_statespace_filters import (
     plot_average,
+    plot_drift,
     plot_evidence,
     plot_filter_health,
     plot_forecast,
@@ -32,6 +33,7 @@ def errors_of(idata, **settings):
 
 
 PLOTS = [
+    (plot_drift, "drift_scan"),
     (plot_evidence, "table"),
     (plot_evidence, "estimates"),
     (plot_model_probabilities, "table"),

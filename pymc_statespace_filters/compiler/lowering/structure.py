@@ -285,3 +285,17 @@ def is_free_of(
     sizes = {name: int(np.prod(symbols[name].type.shape, dtype=int)) for name in names}
     inputs = {f"{name}.{i}" for name, size in sizes.items() for i in range(size)}
     return not depends_on(values, frozenset(inputs))
+
+
+def parameters_after_start(system: StateSpaceModel) -> list[bool]:
+    """Which elements of theta the equations of a step or an observation use; all if undecided."""
+    system = system.gaussian
+    symbols = symbols_of(system)
+    moments = [*transition_moments(system, symbols)]
+    if system.equations.observation is not None:
+        moments += observation_moments(system, symbols)
+    try:
+        (values,) = unrolled(Graph(symbols, [pt.concatenate([m.ravel() for m in moments])]))
+    except NotUnrollableError:
+        return [True] * system.n_theta
+    return [bool(depends_on(values, frozenset({f"theta.{i}"}))) for i in range(system.n_theta)]

@@ -1,0 +1,126 @@
+"""The table of `drift_scan`."""
+
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from numpy.typing import NDArray
+
+from ...tables import SentenceTable
+from .axis import TimeAxis
+from .simulations import Statistics
+from .statistics import p_values
+
+LEVEL = 0.05
+LEAST_SHARE = 0.05  # of the information, before and after a change
+
+Array = NDArray[np.float64]
+
+
+class DriftScan(SentenceTable):
+    """A DataFrame with a row for each parameter, most suspicious first, and the paths of its sums.
+
+    Attributes
+    ----------
+    paths : xarray.Dataset
+        For `plot_drift`: along ``parameter`` and the rows of the data ``cumulated``, the sum of the
+        scores before each row in standard deviations, and ``band``, within which the whole path of
+        a constant parameter stays with 95 % probability; ``turn`` is the number of the row in
+        ``time``. In a panel the sum is that of the rows
+        from each one to the end of its record, with the sign changed, so that it ends at zero.
+    """
+
+    _metadata: ClassVar[list[str]] = ["sentences", "paths"]
+    main_columns = ("p_value", "p_alone", "statistic", "record", "time", "change")
+
+    def __init__(self, data: Any = None, *, paths: xr.Dataset, **settings: Any) -> None:
+        super().__init__(data, **settings)
+        self.paths = paths
+
+    def __copy__(self, deep: bool = False) -> Self:
+        return type(self)(self.copy(deep), paths=self.paths, sentences=self.sentences)
+
+    def _texts(self, name: str) -> list[str]:
+        return [_text(name, value) for value in self[name]]
+
+
+def _text(name: str, value: Any) -> str:
+    if name.startswith("p_"):
+        return f"{value:.3f}"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def scan_table(found: Statistics, labels: list[str], axis: TimeAxis) -> DriftScan:
+    """The table of parameters with these labels, most suspicious first."""
+    values = p_values(found.data, found.simulated)
+    at = _turns(found, len(axis.labels))
+    columns: dict[str, Any] = {
+        "p_value": values.adjusted,
+        "p_alone": values.alone,
+        "statistic": (found.data - found.simulated.mean(axis=0)) / found.simulated.std(axis=0),
+    }
+    if axis.is_panel:
+        columns["record"] = [axis.labels[axis.of_rows[i]] for i in at]
+    columns |= {"time": axis.shown[at], "change": _changes(found, at)}
+    table = pd.DataFrame(columns, index=pd.Index(labels, name="parameter"))
+    table = table.sort_values(["p_alone", "statistic"], ascending=[True, False], kind="stable")
+    text = _sentences(table, len(found.simulated))
+    return DriftScan(table, paths=_paths(found, labels, axis, at), sentences=text)
+
+
+def _turns(found: Statistics, n_records: int) -> NDArray[np.int64]:
+    """The rows (k,) before which parameters change, if they jump once: the likeliest, nearly.
+
+    The gain of log-likelihood by a jump is half of R^2 / [A (1 - A / V)], with the information A
+    in the rows after it and V in all.
+    """
+    share = found.information / found.total
+    with np.errstate(divide="ignore", invalid="ignore"):
+        gain = found.remaining**2 / (share * (1 - share))
+    inside = (share > LEAST_SHARE / n_records) & (share < 1 - LEAST_SHARE / n_records)
+    return np.asarray(np.where(inside, gain, -1.0).argmax(axis=0))
+
+
+def _changes(found: Statistics, at: NDArray[np.int64]) -> Array:
+    """The changes (k,) of parameters that jump once, at rows (k,), to first order."""
+    k = np.arange(len(at))
+    after = found.information[at, k]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(found.remaining[at, k] * found.total / (after * (found.total - after)))
+
+
+def _paths(
+    found: Statistics, labels: list[str], axis: TimeAxis, at: NDArray[np.int64]
+) -> xr.Dataset:
+    sd = np.sqrt(found.total)
+    sums = -found.remaining / sd
+    band = np.quantile(found.largest / sd, 1 - LEVEL, axis=0)
+    rows = "row" if axis.is_panel else "time"
+    coords: dict[str, Any] = {"parameter": labels, "time": (rows, axis.shown)}
+    if axis.is_panel:
+        coords["record"] = (rows, np.array(axis.labels)[axis.of_rows])
+    return xr.Dataset(
+        {
+            "cumulated": (("parameter", rows), sums.T),
+            "band": ("parameter", band),
+            "turn": ("parameter", at),
+        },
+        coords=coords,
+    )
+
+
+def _sentences(table: pd.DataFrame, n_simulated: int) -> list[str]:
+    """What the display says below the columns."""
+    found = [
+        f"p_value is for all {len(table)} parameters together, p_alone for one; from {n_simulated} "
+        "simulated data sets with constant parameters, each estimated anew."
+    ]
+    for name, row in table[table["p_value"] <= LEVEL].iterrows():
+        way = "rises" if row["change"] > 0 else "falls"
+        where = f" in record {row['record']!r}" if "record" in row else ""
+        found.append(
+            f"{name} varies: if it is one jump, it {way} by about {abs(row['change']):.2g} before "
+            f"the row at {row['time']}{where}."
+        )
+    return found

@@ -1,0 +1,183 @@
+"""The terms of a variable and their scores, for many data sets at once, each at its own point.
+
+A score is the derivative of a term log p(d_j | d_1 .. d_{j-1}) by a parameter.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import pymc as pm
+from numpy.typing import NDArray
+from pytensor.graph.basic import Variable
+from pytensor.graph.traversal import ancestors
+
+from ..compiler.lowering.structure import parameters_after_start
+from ..compiler.native.rows import interpreted_at_points
+from ..errors import ModelError
+from ..filters.recommendation import short_form
+from ..filters.signatures import PANEL
+from ..ops.base import evaluator
+from ..ops.likelihood import LogLikelihood
+from ..system.panel_records import N_COLUMNS, RECORD, STEP
+from .density import RowFunction, check_free_variables
+from .inspection import scored_rows, state_space_nodes
+from .random_variable import draw_in_python
+
+STEP_OF_X = 1e-5  # of the unconstrained parameters, whose unit is about one
+STEP_OF_THETA = 1e-3  # in standard deviations of the posterior
+
+Array = NDArray[np.float64]
+
+
+class Scores(NamedTuple):
+    """Terms and scores of m data sets of J rows.
+
+    ``terms`` (m, J); ``by_theta`` (m, J, k), by the parameters of the row's record, and
+    ``curvature`` (m, J, k), minus the second derivatives; ``by_x`` (m, J, k_x), by the
+    unconstrained free variables.
+    """
+
+    terms: Array
+    by_theta: Array
+    curvature: Array
+    by_x: Array
+
+
+class ScoredVariable:
+    """An observed StateSpace variable, or a panel, with data sets in place of its own.
+
+    Parameters
+    ----------
+    model : pymc.Model
+    name : str
+        Of the variable, with a filter that is smooth and without noise.
+
+    Attributes
+    ----------
+    system, filter, clock
+    steps : ndarray (J,)
+    of_rows : ndarray (J,)
+        The number of the record of each row.
+    observed : ndarray (J, p)
+    """
+
+    def __init__(self, model: pm.Model, name: str) -> None:
+        check_free_variables(model)
+        node = state_space_nodes(model)[name]
+        self.name, self.system, self.filter = name, node.op.system, node.op.filter
+        _check_filter(name, self.filter)
+        self.clock, self._op, self._scored = node.op.clock, node.op, scored_rows(node)
+        theta, *record = model.replace_rvs_by_values(list(node.inputs[-5:-1]))
+        self._values = [model.rvs_to_values[rv] for rv in model.free_RVs]
+        _check_record(name, record, self._values)
+        table, self._inputs, self._t0 = (graph.eval(mode="FAST_COMPILE") for graph in record)
+        self.is_panel = table.ndim == 2
+        self._arguments = table
+        self._rows = table if self.is_panel else _rows(table)
+        self.steps = self._rows[:, STEP]
+        codes = self._rows[:, RECORD]
+        self.of_rows = np.cumsum(np.diff(codes, prepend=codes[0]) != 0)
+        observed = model.rvs_to_values[node.outputs[1]]
+        self.observed = np.asarray(observed.eval(mode="FAST_COMPILE"), dtype=np.float64)
+        self._evaluate = evaluator(LogLikelihood(self.system, self.filter, PANEL))
+        self._theta = interpreted_at_points(self._values, theta)
+        point = model.initial_point()
+        self._shapes = [point[value.name].shape for value in self._values]
+        others = [v for v in [*model.basic_RVs, *model.potentials] if v.name != name]
+        self._others = RowFunction(model, model.logp(vars=others))
+
+    @property
+    def n_records(self) -> int:
+        """Number of records of a panel, or one."""
+        return int(self.of_rows[-1]) + 1
+
+    @property
+    def labels(self) -> list[str]:
+        """The names of the elements of theta (k,)."""
+        return [
+            name + (f"[{', '.join(map(str, index))}]" if index else "")
+            for name, shape in zip(
+                self.system.parameters, self.system.parameter_shapes, strict=True
+            )
+            for index in np.ndindex(shape)
+        ]
+
+    @property
+    def act_after_start(self) -> NDArray[np.bool_]:
+        """Which elements of theta (k,) the equations of a step or an observation use."""
+        return np.array(parameters_after_start(self.system))
+
+    def theta(self, x: Array) -> Array:
+        """The parameters (m, G, k) of every record at points x (m, k_x)."""
+        sizes = [int(np.prod(shape)) for shape in self._shapes]
+        columns = np.split(x, np.cumsum(sizes)[:-1], axis=1)
+        parts = [c.reshape(len(x), *shape) for c, shape in zip(columns, self._shapes, strict=True)]
+        found = self._theta(*parts)
+        return found if self.is_panel else found[:, None]
+
+    def other_density(self, x: Array) -> Array:
+        """The log-density (m,) of everything in the model but this variable, at x (m, k_x)."""
+        return self._others.evaluate(x)
+
+    def simulate(self, x: Array, count: int, rng: np.random.Generator) -> Array:
+        """Data sets (count, J, p) at a point x (k_x,), missing where the data are."""
+        theta = self.theta(x[None])[0]
+        record = self._arguments, self._inputs, self._t0, 0, None
+        own = theta if self.is_panel else theta[0]
+        found = np.stack([draw_in_python(self._op, rng, own, *record) for _ in range(count)])
+        return np.where(np.isnan(self.observed), np.nan, found)
+
+    def terms(self, theta: Array, observed: Array) -> Array:
+        """Terms (m, J) of data sets (m, J, p) at parameters (m, G, k); 0 of rows not scored."""
+        m, n_rows = observed.shape[:2]
+        table = np.tile(self._rows, (m, 1))
+        records = np.add.outer(np.arange(m) * self.n_records, self.of_rows)
+        table[:, RECORD] = records.ravel()
+        below = theta.reshape(-1, theta.shape[-1]), table, observed.reshape(m * n_rows, -1)
+        found = self._evaluate(*below, self._inputs, self._t0, np.asarray(0))[0]
+        kept = np.zeros(n_rows)
+        kept[self._scored] = 1.0
+        return np.asarray(found.reshape(m, n_rows) * kept)
+
+    def scores(self, x: Array, observed: Array, scale: Array) -> Scores:
+        """Scores of data sets (m, J, p) at points (m, k_x); ``scale`` (k,) is that of theta."""
+        theta, h = self.theta(x), STEP_OF_THETA * scale
+        moves = np.concatenate([np.zeros((1, len(h))), np.diag(h), -np.diag(h)])
+        points = (theta + moves[:, None, None]).reshape(-1, *theta.shape[1:])
+        copies = np.tile(observed, (len(moves), 1, 1))
+        terms = self.terms(points, copies).reshape(len(moves), *observed.shape[:2])
+        here, up, down = terms[0], *(np.moveaxis(part, 0, -1) for part in np.split(terms[1:], 2))
+        by_theta, curvature = (up - down) / (2 * h), (2 * here[..., None] - up - down) / h**2
+        jacobian = self.jacobian(x)[:, self.of_rows]
+        by_x = np.einsum("mji,mjix->mjx", by_theta, jacobian)
+        return Scores(here, by_theta, curvature, by_x)
+
+    def jacobian(self, x: Array) -> Array:
+        """The derivatives (m, G, k, k_x) of theta by x."""
+        moves = STEP_OF_X * np.eye(x.shape[1])
+        up, down = (self.theta((x[:, None] + t * moves).reshape(-1, x.shape[1])) for t in (1, -1))
+        difference = (up - down).reshape(len(x), x.shape[1], *up.shape[1:])
+        return np.moveaxis(difference, 1, -1) / (2 * STEP_OF_X)
+
+
+def _rows(steps: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The rows (J, 3) of a panel with a single record."""
+    rows = np.zeros((len(steps), N_COLUMNS), np.int64)
+    rows[:, STEP] = steps
+    return rows
+
+
+def _check_filter(name: str, filter: object) -> None:
+    if not getattr(filter, "has_gradient", False):
+        raise ModelError(
+            f"the filter of {name!r} must be EKF, UKF or IPLF, whose terms are smooth in the "
+            f"parameters, got {short_form(filter)}: estimate and scan the model with one of these"
+        )
+
+
+def _check_record(name: str, record: list[Variable], values: list[Variable]) -> None:
+    if set(ancestors(record)) & set(values):
+        raise ModelError(
+            f"the steps, inputs and t0 of {name!r} must not depend on free variables: give them as "
+            "numbers, and what is estimated as parameters of the system"
+        )

@@ -1,0 +1,193 @@
+"""The scan for parameters that vary, against exact derivatives and data of known changes."""
+
+from functools import cache
+
+import numpy as np
+import pymc as pm
+import pytest
+from scipy.stats import kstest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.diagnostics.constancy.axis import TimeAxis
+from pymc_statespace_filters.diagnostics.constancy.simulations import ConstancyTest
+from pymc_statespace_filters.diagnostics.constancy.statistics import constancy, p_values
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.pymc_model.term_scores import ScoredVariable
+from tests.systems import driven, driven_by_wandering_gain
+
+N_ROWS = 100
+FORCE = np.random.default_rng(0).normal(size=(N_ROWS, 1))
+STEPS = np.arange(1, N_ROWS + 1)
+TRUE = {"a": 0.7, "gain": 1.0, "sigma": 0.3}
+AT_TRUE = np.array([0.7, np.log(0.3), 1.0])  # of the free variables, unconstrained
+
+
+def simulated(random_seed, strength=0.0, **changes):
+    values = {"strength": strength} | TRUE | changes
+    run = psf.simulate(
+        driven_by_wandering_gain(), values, steps=STEPS, inputs=FORCE, random_seed=random_seed
+    )
+    return run["observations"].values[:, 0]
+
+
+def jumping(random_seed, to, at=60):
+    """A record whose gain jumps."""
+    rng, x, observed = np.random.default_rng(random_seed), 0.0, []
+    for k in range(N_ROWS):
+        gain = TRUE["gain"] if k < at else to
+        x = TRUE["a"] * x + gain * FORCE[k, 0] + TRUE["sigma"] * rng.normal()
+        observed.append(x + 0.2**0.5 * rng.normal())
+    return np.array(observed)
+
+
+def driven_model(observed, **settings):
+    with pm.Model() as model:
+        pm.Normal("a", 0.5, 0.3)
+        pm.HalfNormal("sigma", 1.0)
+        pm.Normal("gain", 0, 2)
+        record = {"steps": STEPS, "inputs": FORCE, "observed": observed} | settings
+        psf.StateSpace("d", driven(), record.pop("filter", psf.EKF()), **record)
+    return model
+
+
+@cache
+def constant_record():
+    """The variable of a model, in which data are replaced, and the durations of its rows."""
+    model = driven_model(simulated(1))
+    variable = ScoredVariable(model, "d")
+    return variable, TimeAxis.of(model, variable).durations
+
+
+class Point:
+    """A point estimate, as that of `maximum_likelihood`."""
+
+    unconstrained = AT_TRUE
+
+
+def test_statistic_is_the_derivative_by_the_variance_of_a_walk():
+    """Exact where a term depends on the parameter of its own step alone, a = 0, but for the first
+    of 100 steps, in which the parameter has not moved yet.
+    """
+    variable, durations = constant_record()
+    x, scale = np.array([[0.0, np.log(0.3), 1.0]]), np.full(len(variable.labels), 0.03)
+    scores = variable.scores(x, variable.observed[None], scale)
+    found = constancy(scores, durations, variable.of_rows)
+    free = constancy(scores._replace(by_x=0 * scores.by_x), durations, variable.of_rows)
+    index = variable.labels.index("gain")
+    values = {"a": 0.0, "sigma": 0.3, "gain": 1.0}
+
+    def log_likelihood(strength):
+        terms = psf.log_likelihood(
+            driven_by_wandering_gain(), psf.EKF(), values | {"strength": strength},
+            variable.observed, steps=STEPS, inputs=FORCE,
+        )  # fmt: skip
+        return terms.sum()
+
+    gained = [(log_likelihood(s) - log_likelihood(0.0)) / s**2 for s in (2e-3, 1e-3)]
+    exact = gained[1] + (gained[1] - gained[0]) / 3
+    half_duration = durations.sum() / 2
+    np.testing.assert_allclose(free.statistic[0, index] * half_duration, exact, rtol=0.01)
+    # at a point that is no estimate the projection takes the sums of all scores away
+    estimated = [variable.labels.index(name) for name in TRUE]
+    np.testing.assert_allclose(found.remaining[0, 0, estimated], 0, atol=1e-5)
+
+
+def test_p_values_by_hand():
+    simulated = np.array([[1.0, 5.0], [2.0, 6.0], [3.0, 7.0]])
+    alone, adjusted = p_values(np.array([2.5, 9.0]), simulated)
+    np.testing.assert_allclose(alone, [0.5, 0.25])
+    # the smallest p-values are 1/4 of the data; 4/4, 3/4 and 1/4 of the others
+    np.testing.assert_allclose(adjusted, [0.5, 0.5])
+
+
+def p_values_of_constant_records(n_records, n_simulated):
+    variable, durations = constant_record()
+    observed, found = variable.observed, []
+    try:
+        for i in range(n_records):
+            variable.observed = simulated(5000 + i)[:, None]
+            test = ConstancyTest(variable, durations, AT_TRUE)
+            result = test.run(np.arange(3), n_simulated, np.random.default_rng(i))
+            values = p_values(result.data, result.simulated)
+            found.append([*values.alone, values.adjusted.min()])
+    finally:
+        variable.observed = observed
+    spread = np.random.default_rng(1).random((n_records, 4)) / (n_simulated + 1)
+    return np.array(found) - spread
+
+
+def test_p_values_of_constant_parameters_are_uniform():
+    """Fails by chance once in 2500, four comparisons together."""
+    found = p_values_of_constant_records(40, 19)
+    assert min(kstest(column, "uniform").pvalue for column in found.T) > 1e-4
+
+
+@pytest.mark.slow
+def test_p_values_of_many_constant_records_are_uniform():
+    found = p_values_of_constant_records(200, 99)
+    assert min(kstest(column, "uniform").pvalue for column in found.T) > 1e-3
+
+
+def test_a_jump_is_found_with_its_time_and_size():
+    scan = psf.drift_scan(Point(), driven_model(jumping(3, to=2.0)), random_seed=1)
+    first = scan.iloc[0]
+    assert scan.index[0] == "gain"
+    assert set(scan.index) == {"a", "gain", "sigma"}  # and not the mean of the start
+    assert first["p_value"] <= 0.01
+    assert abs(first["time"] - 61) <= 8
+    assert 0.5 < first["change"] < 1.5
+    assert "gain varies: if it is one jump, it rises" in repr(scan)
+    assert (scan["p_alone"] <= scan["p_value"]).all()
+    path = scan.paths["cumulated"].sel(parameter="gain")
+    assert abs(path).max() > scan.paths["band"].sel(parameter="gain")
+    assert float(path["time"][scan.paths["turn"].sel(parameter="gain")]) == first["time"]
+
+
+def test_draws_and_an_estimate_give_the_same():
+    model = driven_model(simulated(2))
+    draws = psf.sample_dram(200, tune=200, model=model, random_seed=1, progressbar=False)
+    tables = [psf.drift_scan(one, model, n_simulated=39, random_seed=3) for one in (draws, Point())]
+    statistics = [table["statistic"].sort_index() for table in tables]
+    np.testing.assert_allclose(*statistics, rtol=0.1, atol=0.1)
+
+
+def test_the_record_of_a_panel_that_changes_is_named():
+    records = [simulated(1), jumping(3, to=2.0), simulated(2)]
+    observed = np.concatenate(records)
+    observed[[5, 130]] = np.nan
+    panel = np.repeat(["A", "B", "C"], N_ROWS)
+    model = driven_model(observed, panel=panel, steps=np.tile(STEPS, 3), score_from=2)
+    scan = psf.drift_scan(Point(), model, n_simulated=99, random_seed=1)
+    first = scan.iloc[0]
+    assert (scan.index[0], first["record"]) == ("gain", "B")
+    assert first["p_alone"] <= 0.01
+    assert abs(first["time"] - 61) <= 8
+    assert "in record 'B'" in repr(scan).replace("\n ", "")
+    assert scan.paths.sizes["row"] == 3 * N_ROWS
+
+
+def test_chosen_parameters():
+    model = driven_model(simulated(2))
+    scan = psf.drift_scan(Point(), model, parameters="gain", n_simulated=19, random_seed=1)
+    assert list(scan.index) == ["gain"]
+    assert scan["p_value"].iloc[0] == scan["p_alone"].iloc[0]
+    # fixed at a number, of the sensor
+    fixed = psf.drift_scan(Point(), model, parameters=["sensor"], n_simulated=19, random_seed=1)
+    assert list(fixed.index) == ["sensor"]
+
+
+def test_bad_arguments():
+    model = driven_model(simulated(2))
+    with pytest.raises(ModelError, match=r"parameters must be some of \['a', .*got \['b'\]"):
+        psf.drift_scan(Point(), model, parameters=["b"])
+    with pytest.raises(ModelError, match=r"after the start of a record, got \['start'\]"):
+        psf.drift_scan(Point(), model, parameters=["start"])
+    with pytest.raises(ModelError, match="n_simulated must be an integer of at least 19, got 5"):
+        psf.drift_scan(Point(), model, n_simulated=5)
+    with pytest.raises(ModelError, match="var_name"):
+        psf.drift_scan(Point(), model, var_name="y")
+    with pytest.raises(ModelError, match="idata must be a DataTree"):
+        psf.drift_scan(1.0, model)
+    noisy = driven_model(simulated(2), filter=psf.BootstrapPF(100))
+    with pytest.raises(ModelError, match=r"must be EKF, UKF or IPLF.*BootstrapPF\(100\)"):
+        psf.drift_scan(Point(), noisy)
