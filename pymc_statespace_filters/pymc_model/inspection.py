@@ -10,6 +10,8 @@ import pymc as pm
 from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import ancestors
+from pytensor.tensor.basic import Join
+from pytensor.tensor.shape import SpecifyShape
 from pytensor.tensor.variable import TensorVariable
 
 from ..compiler.lowering.compiled_system import compile_system
@@ -35,6 +37,16 @@ def state_space_nodes(model: pm.Model) -> dict[str, Any]:
         for rv in model.basic_RVs
         if rv.owner is not None and isinstance(rv.owner.op, StateSpaceRV)
     }
+
+
+def parameter_graphs(node: Any) -> dict[str, Variable]:
+    """The graph of each parameter of a StateSpace variable; empty where theta is made otherwise."""
+    theta, parameters = node.inputs[-5], node.op.system.parameters
+    while theta.owner is not None and isinstance(theta.owner.op, SpecifyShape):
+        theta = theta.owner.inputs[0]
+    is_joined = theta.owner is not None and isinstance(theta.owner.op, Join)
+    parts = theta.owner.inputs if is_joined else [theta]
+    return dict(zip(parameters, parts, strict=True)) if len(parts) == len(parameters) else {}
 
 
 def observes_state_space(model: pm.Model) -> bool:

@@ -8,13 +8,11 @@ from weakref import WeakKeyDictionary
 
 import pymc as pm
 from pytensor.graph.traversal import ancestors
-from pytensor.tensor.basic import Join
-from pytensor.tensor.shape import SpecifyShape
 
 from ..errors import ModelWarning
 from ..system.equations import RESERVED
 from .held_seed import INSIDE
-from .inspection import state_space_nodes
+from .inspection import parameter_graphs, state_space_nodes
 
 # Of the similarity of two names from 0 to 1: "beta" and "b" have 0.4.
 _SIMILAR = 0.35
@@ -59,19 +57,9 @@ def _unused_priors(model: pm.Model, nodes: dict[str, Any]) -> Iterator[str]:
 
 def _constant_parameters(model: pm.Model, node: Any) -> list[str]:
     """The parameters of a StateSpace variable that depend on no random variable."""
-    theta, parameters = node.inputs[-5], node.op.system.parameters
-    while theta.owner is not None and isinstance(theta.owner.op, SpecifyShape):
-        theta = theta.owner.inputs[0]
-    is_joined = theta.owner is not None and isinstance(theta.owner.op, Join)
-    parts = theta.owner.inputs if is_joined else [theta]
-    if len(parts) != len(parameters):
-        return []
     random = set(model.basic_RVs)
-    return [
-        name
-        for name, part in zip(parameters, parts, strict=True)
-        if random.isdisjoint(ancestors([part]))
-    ]
+    graphs = parameter_graphs(node).items()
+    return [name for name, graph in graphs if random.isdisjoint(ancestors([graph]))]
 
 
 def _probable_cause(name: str, fixed: dict[str, str]) -> str:

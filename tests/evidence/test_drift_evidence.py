@@ -208,6 +208,33 @@ def test_fitted_density_of_a_strength_follows_the_other_parameters():
     assert fitted.shape == pytest.approx(0.5, abs=0.03)
 
 
+def test_strengths_of_a_drifting_system_are_found():
+    observed = record(0.4, 5)
+    constant = psf.StateSpaceModel(
+        transition=lambda x, q: [0.0 * x[0]],
+        process_noise=[[1.0]],
+        observation=lambda x, mu: [mu + x[0]],
+        observation_noise=[[1.0]],
+        initial_mean=[0.0],
+        initial_cov=[[0.0]],
+    )
+    drifting = psf.drifting(constant, mu=psf.RandomWalk())
+    with pm.Model() as model:
+        pm.Normal("mu", 0, MEAN_SD)
+        width = pm.HalfNormal("width", WIDTH)
+        psf.StateSpace(
+            "d", drifting, psf.EKF(), steps=range(N_ROWS), observed=observed,
+            params={"mu_strength": width},
+        )  # fmt: skip
+    draws = exact_draws(observed, *PRIORS["half-normal"])
+    draws["posterior"] = draws["posterior"].to_dataset().rename(mu_strength="width")
+    row = psf.drift_evidence(draws, model, **QUIET).loc["width"]
+    exact = exact_log_bayes_factor(observed)
+    assert abs(row["log_bayes_factor"] - exact) < 3.5 * row["se"]
+    with pytest.raises(ModelError, match="no system of the model is made by"):
+        psf.drift_evidence(draws, drifting_model(0.0, 1)[0])
+
+
 def test_bad_arguments():
     model, observed = drifting_model(0.0, 1)
     idata = exact_draws(observed, *PRIORS["half-normal"], n=(2, 50))

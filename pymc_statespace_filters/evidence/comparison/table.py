@@ -1,6 +1,7 @@
 """The table of `compare_evidence`."""
 
 import math
+from typing import ClassVar
 
 import pandas as pd
 
@@ -13,7 +14,14 @@ FEWEST_DECIMALS, MOST_DECIMALS = 2, 4
 class EvidenceTable(SentenceTable):
     """The comparison of models; the sentences are about them."""
 
-    main_columns = ("prob", "prob_low", "prob_high", "log_evidence", "se", "step_error")
+    main_columns: ClassVar[tuple[str, ...]] = (
+        "prob",
+        "prob_low",
+        "prob_high",
+        "log_evidence",
+        "se",
+        "step_error",
+    )
 
     def _texts(self, name: str) -> list[str]:
         if name in ("log_evidence", "log_bayes_factor", "se", "step_error"):

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.stats import norm
 
 from ...compiler.native.compilation import COMPILATION
-from ...errors import EvidenceWarning, ModelError
+from ...errors import EvidenceWarning
 from ...importance import (
     MIN_EFFECTIVE,
     LogMean,
@@ -163,7 +163,7 @@ def drift_evidence(
     factors, rng = width_factors(widths), check_random_seed(random_seed)
     prior = prior_weights(model_prior, MODELS)
     posterior_group(idata)  # fails early, before anything is compiled
-    names = _strengths(model, var_names)
+    names = chosen_strengths(model, var_names)
     sets = [(name,) for name in names] + ([tuple(names)] if len(names) > 1 else [])
     log_terms, of_chains = _log_terms(idata, model, sets, rng, progressbar)
     means = {one: log_mean_of_chains(terms) for one, terms in log_terms.items()}
@@ -180,16 +180,6 @@ def drift_evidence(
     )
     others = [rv.name for rv in model.free_RVs if rv.name not in names]
     return DriftTable(table, widths=curves, sentences=[*sentences(table, others, ci_prob)])
-
-
-def _strengths(model: pm.Model, var_names: str | Iterable[str] | None) -> list[str]:
-    names = [var_names] if isinstance(var_names, str) else list(var_names or ())
-    if not names:
-        raise ModelError(
-            "var_names must name the strengths of the drift, free variables that are zero if "
-            "nothing drifts: no system of the model is made by psf.drifting"
-        )
-    return chosen_strengths(model, names)
 
 
 def _log_terms(

@@ -4,7 +4,7 @@ A strength is zero or positive, or of either sign if the likelihood is even in i
 parameter is constant.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +17,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from ...compiler.native.rows import at_points
 from ...errors import ModelError
+from ...pymc_model.inspection import parameter_graphs, state_space_nodes
 from ...pymc_model.prior import is_improper
 from ..comparison.scaled_prior import bounds_of_support
 
@@ -37,10 +38,14 @@ class Strengths(NamedTuple):
     is_signed: NDArray[np.bool_]
 
 
-def chosen_strengths(model: pm.Model, names: Iterable[str]) -> list[str]:
+def chosen_strengths(model: pm.Model, names: str | Iterable[str] | None) -> list[str]:
     """Check that free variables can be strengths; return their names, each once."""
-    chosen = list(dict.fromkeys(names))
+    if names is None:
+        names = _strengths_of_systems(model)
+    chosen = list(dict.fromkeys([names] if isinstance(names, str) else names))
     free = [rv.name for rv in model.free_RVs]
+    if not chosen:
+        raise ModelError("var_names must name at least one free variable, got none")
     if unknown := [name for name in chosen if name not in free]:
         raise ModelError(f"var_names must be free variables of the model, {free}, got {unknown}")
     if set(chosen) == set(free):
@@ -56,6 +61,30 @@ def chosen_strengths(model: pm.Model, names: Iterable[str]) -> list[str]:
                 f"pm.HalfNormal({name!r}, ...)"
             )
     return chosen
+
+
+def _strengths_of_systems(model: pm.Model) -> Iterator[str]:
+    """The free variables that are strengths of drifting parameters of the observed systems."""
+    free, found = set(model.free_RVs), False
+    for node in state_space_nodes(model).values():
+        graphs = parameter_graphs(node)
+        for name in dict.fromkeys(one.strength for one in node.op.system.drifting):
+            graph = graphs.get(name)
+            known = [] if graph is None else ancestors([graph], blockers=free)
+            variables = [rv.name for rv in free if rv in set(known)]
+            if len(variables) > 1:
+                raise ModelError(
+                    f"var_names must name the free variable that is the strength {name!r}, which "
+                    f"depends on {sorted(variables)}"
+                )
+            found = found or bool(variables)
+            yield from variables
+    if not found:
+        raise ModelError(
+            "var_names must name the strengths of the drift, free variables that are zero if "
+            "nothing drifts: no system of the model is made by psf.drifting and has a strength "
+            "with a prior"
+        )
 
 
 class StrengthsAtPoints:

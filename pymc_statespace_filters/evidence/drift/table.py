@@ -19,7 +19,13 @@ class DriftTable(EvidenceTable):
     """
 
     _metadata: ClassVar[list[str]] = ["sentences", "widths"]
-    main_columns = ("prob", "prob_low", "prob_high", "log_bayes_factor", "se")
+    main_columns: ClassVar[tuple[str, ...]] = (
+        "prob",
+        "prob_low",
+        "prob_high",
+        "log_bayes_factor",
+        "se",
+    )
 
     def __init__(self, data: Any = None, *, widths: xr.Dataset, **settings: Any) -> None:
         super().__init__(data, **settings)
