@@ -70,8 +70,8 @@ def _strengths_of_systems(model: pm.Model) -> Iterator[str]:
         graphs = parameter_graphs(node)
         for name in dict.fromkeys(one.strength for one in node.op.system.drifting):
             graph = graphs.get(name)
-            known = [] if graph is None else ancestors([graph], blockers=free)
-            variables = [rv.name for rv in free if rv in set(known)]
+            known = set() if graph is None else set(ancestors([graph], blockers=free))
+            variables = [rv.name for rv in model.free_RVs if rv in known]
             if len(variables) > 1:
                 raise ModelError(
                     f"var_names must name the free variable that is the strength {name!r}, which "

@@ -41,7 +41,9 @@ def sentences(table: pd.DataFrame, others: list[str], ci_prob: float) -> Iterato
         "prob is that of drift, against the model with the strength at zero and the same priors of "
         f"{', '.join(others)}."
     )
-    if open_ones := [name for name, row in table.iterrows() if row["undecided"]]:
+    if open_ones := [
+        name for name, row in table.iterrows() if row["undecided"] and not row["doubts"]
+    ]:
         yield f"Undecided at {100 * ci_prob:g} %: whether {' and '.join(open_ones)} is zero."
     for name, row in table.iterrows():
         if row["doubts"]:
