@@ -11,7 +11,6 @@ from scipy.integrate import quad
 from scipy.stats import halfnorm, multivariate_normal, norm
 
 from pymc_statespace_filters import progress
-from pymc_statespace_filters.compiler.native import rows
 from pymc_statespace_filters.errors import DataMismatchError, EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence import (
     Evidence,
@@ -20,6 +19,7 @@ from pymc_statespace_filters.evidence import (
     estimate_evidence,
     runner,
 )
+from pymc_statespace_filters.parallel import threads
 from tests.evidence.analytic import Regression, autoregressive
 
 RNG = np.random.default_rng(20)
@@ -200,7 +200,7 @@ def test_the_number_of_threads_changes_no_number(regression_model, monkeypatch, 
         pools.append(n_threads)
         return ThreadPoolExecutor(n_threads)
 
-    monkeypatch.setattr(rows, "ThreadPoolExecutor", pool)
+    monkeypatch.setattr(threads, "ThreadPoolExecutor", pool)
     idata = exact_draws((2, 500))
     settings = {"n_proposals": 400, "random_seed": 1}
     of_cores = chib_jeliazkov(idata, regression_model, cores=cores, **settings)
