@@ -85,7 +85,7 @@ def drift_scan(
             The same of this parameter alone.
         ``statistic``
             Nyblom's, the mean over time of the squares of the summed scores minus the curvature
-            that belongs to them: in standard deviations from the mean of the simulated data sets.
+            that belongs to them, in standard deviations from the mean of the simulated data sets.
         ``record``
             In a panel, the record of that jump.
         ``time``, ``change``

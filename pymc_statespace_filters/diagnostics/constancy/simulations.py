@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 class Statistics(NamedTuple):
     """Of the data and of B simulated data sets, for k parameters.
 
-    ``data`` (k,) and ``simulated`` (B, k) are derivatives over half the duration; ``remaining``
+    ``data`` (k,) and ``simulated`` (B, k) are those of `Constancy`; ``remaining``
     (J, k) are the sums of the data, ``largest`` (B, k) the largest sums of the simulated ones, and
     ``information`` (J, k) is the mean of the squared sums of a constant parameter over the rows
     from each one to the end of its record, ``total`` (k,) over all rows.

@@ -18,8 +18,8 @@ whatever the point at which they were taken: :math:`h_i (1 - b \cdot g_i)` with 
 all estimated parameters, :math:`b = (\sum g g^T)^{-1} \sum g`.
 
 Differences from the source: the scores of a record in a panel are summed within it; and the sum has
-the observed curvature in place of a division by the sum of squared scores, which a drift increases,
-so that power would be lost.
+the observed curvature in place of the sum of squared scores, which a drift increases, so that power
+would be lost.
 """
 
 from typing import NamedTuple
@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from ...pymc_model.term_scores import Scores
 
 CUTOFF = 1e-10  # relative, of singular values
+LEAST_CURVATURE = 0.01  # of the sum of squared scores, which has the same mean
 
 Array = NDArray[np.float64]
 
@@ -37,8 +38,9 @@ Array = NDArray[np.float64]
 class Constancy(NamedTuple):
     """Of m data sets of J rows and k parameters.
 
-    ``statistic`` (m, k) is the derivative over half the duration; ``remaining`` (m, J, k) are the
-    sums R_j over the rows from j to the end of the record, and ``squares`` (m, J, k) those of h
+    ``statistic`` (m, k) is the derivative over half the duration and over the curvature of all
+    terms, so that its distribution depends little on the parameters; ``remaining`` (m, J, k) are
+    the sums R_j over the rows from j to the end of the record, and ``squares`` (m, J, k) those of h
     squared, of which the mean is the information in these rows.
     """
 
@@ -56,7 +58,9 @@ def constancy(scores: Scores, durations: Array, of_rows: NDArray[np.int64]) -> C
     parts = h, h**2, scores.curvature
     remaining, squares, curvature = (_from_each_row(part, of_rows) for part in parts)
     weighted = np.einsum("j,mjk->mk", durations, remaining**2 - curvature)
-    return Constancy(weighted / durations.sum(), remaining, squares)
+    total = np.maximum(scores.curvature.sum(axis=1), LEAST_CURVATURE * (h**2).sum(axis=1))
+    total = np.maximum(total, np.finfo(float).tiny)
+    return Constancy(weighted / durations.sum() / total, remaining, squares)
 
 
 def _projection(by_x: Array) -> Array:
