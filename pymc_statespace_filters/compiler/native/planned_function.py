@@ -120,7 +120,8 @@ class PlannedFunction:
 
     def __call__(self, *values: Any) -> Any:
         """Call from Python; arrays are contiguous and of the right types."""
-        words, made = self._prepared(values)
+        given = _arrays(values)  # alive until the call has ended
+        words, made = self._prepared(given)
         replacement = words[_REPLACEMENT]
         run = PlanFunction(replacement) if replacement else self.plan.run
         self._check(run(self.plan.address, *_vectors(words)))
@@ -134,16 +135,16 @@ class PlannedFunction:
         It reads the arrays anew each time, also numbers that are passed by value, once they are
         copied to their places. What it checks about their shapes is checked now.
         """
-        words, results = self._prepared(values, is_checked=True)
+        given = _arrays(values)
+        words, results = self._prepared(given, is_checked=True)
         places = [place if is_value else None for place, _, is_value in self._places]
-        return BoundCall(self.plan.address, words, results, places, values)
+        return BoundCall(self.plan.address, words, results, places, given)
 
     def _prepared(
-        self, values: Sequence[Any], *, is_checked: bool = False
+        self, given: Sequence[np.ndarray], *, is_checked: bool = False
     ) -> tuple[array, list[np.ndarray]]:
         """The words of a call with these arguments, and its results, not written yet."""
         words = _DEFAULT_WORDS[:]
-        given = [v if type(v) is np.ndarray else np.asarray(v) for v in _flat_values(values)]
         for (place, shape, is_value), value in zip(self._places, given, strict=True):
             if is_value:
                 words[place] = int(value)
@@ -208,14 +209,15 @@ def _words_of(argument: Argument) -> tuple[int, list[int], bool]:
     return first + argument.slot, [first + slot for slot in argument.shape], argument.is_value
 
 
-def _flat_values(values: Sequence[Any]) -> list[Any]:
+def _arrays(values: Sequence[Any]) -> list[np.ndarray]:
+    """The arguments of a call, those in tuples too, as arrays; numbers become new ones."""
     parts: list[Any] = []
     for value in values:
         if isinstance(value, tuple):
             parts += value
         else:
             parts.append(value)
-    return parts
+    return [part if type(part) is np.ndarray else np.asarray(part) for part in parts]
 
 
 def _shape(name: str, ndim: int) -> tuple[int, list[tuple[int, bool]]]:
