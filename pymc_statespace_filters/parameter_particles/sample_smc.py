@@ -50,9 +50,10 @@ def sample_smc(
     data : {"tempered", "sequential"}
         How the data come in. "tempered": all at once, the likelihood raised to powers that grow
         from 0 to 1; any model. "sequential": row by row, for a model whose data are one record of a
-        `StateSpace` variable, with a filter whose state can go on: `EKF`, `UKF`, `IPLF`,
-        `BootstrapPF`, `EnKF` or `PFEnKF`. Each particle keeps its filter, so that a row costs one
-        update of each; only moves filter the rows so far again. `extend` adds rows later.
+        `StateSpace` variable, with a filter whose state can go on: `EKF`, `UKF`, `IPLF`, `IMM`,
+        `BootstrapPF`, `RBPF`, `EnKF` or `PFEnKF`. Each particle keeps its filter, so that a
+        row costs one update of each; only moves filter the rows so far again. `extend` adds rows
+        later.
     populations : int
         Populations, at least 2, whose spread gives the errors. One more, the pilot, chooses
         temperatures and steps, and is not part of the result.
@@ -88,7 +89,8 @@ def sample_smc(
     ModelError
         If an argument is invalid, a free variable is discrete, the prior cannot be drawn from, the
         likelihood is zero at nearly all its draws, or the data of "sequential" do not come row by
-        row: several variables, a panel, a Potential, a `GuidedPF` or `GridFilter`.
+        row: several variables, a panel, a Potential, a `GuidedPF`, `GridFilter` or
+        `FiniteStateFilter`.
 
     Warns
     -----
