@@ -101,8 +101,8 @@ def chib_jeliazkov(
     -----
     EvidenceWarning
         If the estimate may be unreliable: few terms dominate a mean, the chains disagree, a prior
-        is improper or not normalised, or part of the posterior lies at the stability limit of
-        Euler-Maruyama steps.
+        is improper or not normalised, exchangeable labels lack orders, or part of the posterior
+        lies at the stability limit of Euler-Maruyama steps.
 
     Examples
     --------

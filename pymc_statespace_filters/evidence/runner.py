@@ -27,6 +27,7 @@ from .estimators.maximum_likelihood import N_EVALUATIONS, max_log_likelihood
 from .estimators.protocol import Estimate, Estimator, uses_draws
 from .evidence import Evidence, store_evidence
 from .exact_density import ExactDensity
+from .exchangeable_labels import exchangeable_labels, uncounted_orders
 from .posterior import Posterior, build_posterior, data_fingerprint, observation_count
 from .reweighting.correction import exact_posterior
 from .unreached import check_reached
@@ -35,6 +36,7 @@ MAXIMUM = "maximum likelihood"
 CORRECTION = "correction of the draws"
 SHARED = "shared proposals"
 UNVISITED = "unvisited tails"
+LABELS = "exchangeable labels"
 # CPU seconds for the search for tails that the chains have missed; fewest draws that it needs.
 CHECK_SECONDS, LEAST_DRAWS = 1.0, 4000
 LESS_CERTAIN = "{} is less certain than its standard error suggests"
@@ -67,21 +69,25 @@ def run_estimators(
     exact = None if filter is None else ExactDensity(model, filter)
     density = ModelDensity(model, moved=noise_was_moved(idata))
     posterior, noise = build_posterior(idata, density)
-    support = Support.of(model)
+    entropy = np.random.default_rng(random_seed).integers(2**63, size=2).tolist()
+
+    def stream(name: str) -> np.random.Generator:
+        """Random numbers of a purpose, independent of which others run."""
+        return np.random.default_rng([*entropy, crc32(name.encode())])
+
+    labels = exchangeable_labels(model, idata, posterior.log_density, stream(LABELS))
+    support = Support.of(model, [name for one in labels for name in one.ordered])
     common = (
         *support.check(),
         *check_discretisation(model, idata, posterior.draws),
         *(stored_filter_checks(idata, model, OFF) if exact is None else ()),
     )
-    entropy = np.random.default_rng(random_seed).integers(2**63, size=2).tolist()
-    rng = np.random.default_rng([*entropy, crc32(UNVISITED.encode())])
-    of_chains = (*check_convergence(posterior, idata), *_missed(idata, model, posterior, rng))
+    of_chains = (
+        *check_convergence(posterior, idata),
+        *uncounted_orders(model, labels),
+        *_missed(idata, model, posterior, stream(UNVISITED)),
+    )
     posterior = replace(posterior, shared_seed=(*entropy, crc32(SHARED.encode())))
-
-    def stream(name: str) -> np.random.Generator:
-        """An estimator's random numbers, independent of which others run."""
-        return np.random.default_rng([*entropy, crc32(name.encode())])
-
     with row_progress(exact or density.calls, enabled=progressbar) as announce:
         if exact is not None:
             noise = "refreshed" if exact.n_noisy else "none"

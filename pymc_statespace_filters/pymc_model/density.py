@@ -12,6 +12,8 @@ import numpy as np
 import pymc as pm
 import pytensor
 from numpy.typing import NDArray
+from pymc.logprob.basic import transformed_conditional_logp
+from pymc.logprob.utils import replace_rvs_by_values
 from pymc.pytensorf import compile as compile_pymc
 from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.basic import Variable
@@ -101,7 +103,8 @@ class RowFunction:
     """A scalar function of a model's free variables, compiled over their flat vector.
 
     ``output`` is a scalar graph of the model's value variables; the noise seeds become arguments.
-    ``extra`` are graphs that `calls` evaluates, too.
+    ``extra`` are graphs that `calls` evaluates, too. The variables of the graphs may be others,
+    those of ``point``.
 
     Attributes
     ----------
@@ -114,15 +117,22 @@ class RowFunction:
     """
 
     def __init__(
-        self, model: pm.Model, output: TensorVariable, extra: Sequence[TensorVariable] = ()
+        self,
+        model: pm.Model,
+        output: TensorVariable,
+        extra: Sequence[TensorVariable] = (),
+        point: Mapping[TensorVariable, Array] | None = None,
     ) -> None:
         shared = noise_seeds(model)
         self.seed_names = tuple(shared)
         self.model_seeds = np.array([seed.get_value() for seed in shared.values()], dtype=np.int64)
-        values = [model.rvs_to_values[rv] for rv in model.free_RVs]
-        start = model.initial_point()
-        function, point = compile_raveled(start, [output, *extra], values, shared)
-        example = [point, *self.model_seeds]
+        if point is None:
+            values = [model.rvs_to_values[rv] for rv in model.free_RVs]
+            start = model.initial_point()
+        else:
+            values, start = list(point), {value.name: at for value, at in point.items()}
+        function, vector = compile_raveled(start, [output, *extra], values, shared)
+        example = [vector, *self.model_seeds]
         self.calls = Rows(native_function(function, example), len(example))
 
     def evaluate(self, x: Array, seeds: NDArray[np.int64] | None = None) -> Array:
@@ -151,3 +161,23 @@ class ModelDensity(RowFunction):
         if moved:
             (log_density,) = with_filter([log_density], model, smooth_filters(model))
         super().__init__(model, log_density)
+
+
+class ConstrainedDensity(RowFunction):
+    """The log-density of a model's variables as they are, in the order of ``point``, an example.
+
+    No transform leaves out a part of their support, as an ordering does.
+    """
+
+    def __init__(self, model: pm.Model, point: Mapping[str, Array]) -> None:
+        free = {rv: rv.type(name=rv.name) for rv in model.free_RVs}
+        settings: dict[str, Any] = {
+            "rvs_to_values": model.rvs_to_values | free,
+            "rvs_to_transforms": dict.fromkeys(model.basic_RVs),
+        }
+        terms = transformed_conditional_logp(model.basic_RVs, jacobian=False, **settings)
+        terms += replace_rvs_by_values(model.potentials, **settings)
+        by_name = {value.name: value for value in free.values()}
+        example = {by_name[name]: at for name, at in point.items()}
+        log_density: Any = sum(term.sum() for term in terms)
+        super().__init__(model, log_density, point=example)

@@ -1,6 +1,6 @@
 """The prior of a model on its unconstrained space: support, log-density, draws; likelihood."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -37,10 +37,17 @@ class Support:
     improper: str
 
     @classmethod
-    def of(cls, model: pm.Model) -> "Support":
-        """Inspect the priors of a model's free variables."""
+    def of(cls, model: pm.Model, ordered: Collection[str] = ()) -> "Support":
+        """Inspect the priors of a model's free variables.
+
+        A transform may restrict those that are known to be ``ordered``.
+        """
         widths = {rv.name: log_widths for rv in model.free_RVs for log_widths in _widths(rv, model)}
-        improper = [rv.name for rv in model.free_RVs if is_improper(rv, model)]
+        improper = [
+            rv.name
+            for rv in model.free_RVs
+            if not can_sample(rv, model) or (rv.name not in ordered and is_restricted(rv, model))
+        ]
         return cls(float(sum(widths.values())), ", ".join(widths), ", ".join(improper))
 
     def check(self) -> Iterator[str]:

@@ -1,0 +1,226 @@
+"""Labels that may be exchanged, as those of regimes, and whether all their orders are counted.
+
+If the density of a model stays the same when K labels are permuted in all parameters that have
+them, its posterior has K! equal parts. Draws that stay in one part, and an ordering transform,
+which leaves one part of the prior, lack ln K! of the evidence.
+
+S. Chib, "Marginal likelihood from the Gibbs output", J. Am. Stat. Assoc. 90 (1995), whose estimate
+was corrected so by R. M. Neal, "Erroneous results in 'Marginal likelihood from the Gibbs output'"
+(1999); S. Frühwirth-Schnatter, "Estimating marginal likelihoods for mixture and Markov switching
+models", Econometrics Journal 7 (2004).
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+from numpy.typing import NDArray
+from pytensor.graph.traversal import ancestors
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse.csgraph import connected_components
+from scipy.special import gammaln
+
+from ..pymc_model.density import ConstrainedDensity
+from ..pymc_model.prior import is_restricted
+
+MOST_LABELS, MOST_AXES = 8, 6
+N_POINTS, N_SEEDS = 4, 8  # draws at which densities are compared; estimates of a noisy one
+ROUNDING, MAX_ERROR = 1e-7, 1.0  # relative; in nats, of a noisy difference
+N_ORDERED = 400  # draws whose order is found
+RARELY = 0.1  # of the share that a label would have if all orders were visited equally
+
+Array = NDArray[np.float64]
+Draws = Mapping[str, Array]
+
+
+class Axis(NamedTuple):
+    """An axis of a free variable."""
+
+    name: str
+    number: int
+
+
+@dataclass(frozen=True)
+class Labels:
+    """K labels that may be exchanged, along these axes.
+
+    ``lacking`` is the logarithm of the number of parts of the posterior over those that the draws
+    visit; ``ordered`` are the variables of which a transform leaves one part of the prior.
+    """
+
+    count: int
+    axes: tuple[Axis, ...]
+    lacking: float
+    ordered: tuple[str, ...]
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the variables that have the labels."""
+        return list(dict.fromkeys(axis.name for axis in self.axes))
+
+
+def exchangeable_labels(
+    model: pm.Model, idata: xr.DataTree, log_density: Array, rng: np.random.Generator
+) -> list[Labels]:
+    """Find the labels of a model by permutations at some draws (chain, draw) of its posterior."""
+    posterior = idata["posterior"].to_dataset()
+    draws = {
+        rv.name: _flat(posterior[rv.name].transpose("chain", "draw", ...).values)
+        for rv in model.free_RVs
+    }
+    by_length = _axes_by_length(draws)
+    if not by_length:
+        return []
+    test = _InvarianceTest(model, draws, rng)
+    best = int(np.argmax(log_density))
+    return [
+        _found(model, draws, count, axes, best)
+        for count, all_axes in by_length.items()
+        for axes in _invariant_axes(test, all_axes, count)
+    ]
+
+
+def uncounted_orders(model: pm.Model, found: Sequence[Labels]) -> Iterator[str]:
+    """Yield what the evidence lacks, unless constant Potentials of the model count it."""
+    total = sum(one.lacking for one in found)
+    if abs(total - _constant_potentials(model)) < 0.01:
+        return
+    for one in found:
+        if one.lacking > 0.0:
+            names, orders = ", ".join(one.names), np.exp(one.lacking)
+            why = (
+                "a transform leaves one order of them in the prior"
+                if one.ordered
+                else "the draws do not visit all orders of them"
+            )
+            yield (
+                f"the {one.count} labels of {names} may be exchanged and {why}, so that the "
+                f"log-evidence lacks ln {orders:.0f} = {one.lacking:.3f}: add it, or give the "
+                f"model pm.Potential('orders', np.log({orders:.1f})) before it is sampled"
+            )
+
+
+def _flat(values: Array) -> Array:
+    """Draws (chain, draw, ...) one after the other."""
+    return values.reshape(-1, *values.shape[2:]).astype(np.float64)
+
+
+def _axes_by_length(draws: Draws) -> dict[int, list[Axis]]:
+    found: dict[int, list[Axis]] = {}
+    for name, values in draws.items():
+        for number, length in enumerate(values.shape[1:]):
+            if 2 <= length <= MOST_LABELS:
+                found.setdefault(length, []).append(Axis(name, number))
+    return found
+
+
+def _invariant_axes(
+    test: "_InvarianceTest", axes: Sequence[Axis], count: int
+) -> Iterator[tuple[Axis, ...]]:
+    """Yield the smallest disjoint sets of axes whose labels may be exchanged.
+
+    Of many axes only all together are tried.
+    """
+    taken: set[Axis] = set()
+    sizes = range(1, len(axes) + 1) if len(axes) <= MOST_AXES else [len(axes)]
+    for size in sizes:
+        for some in combinations(axes, size):
+            if not taken & set(some) and test.is_invariant(some, count):
+                taken |= set(some)
+                yield some
+
+
+class _InvarianceTest:
+    """Whether permutations leave the density the same at some draws.
+
+    The density is that of the parameters as they are, without transforms: those may keep an order.
+    """
+
+    def __init__(self, model: pm.Model, draws: Draws, rng: np.random.Generator) -> None:
+        example = {name: values[0] for name, values in draws.items()}
+        self._density = ConstrainedDensity(model, example)
+        n_draws = len(next(iter(draws.values())))
+        chosen = rng.choice(n_draws, N_POINTS, replace=False)
+        self._points = {name: values[chosen] for name, values in draws.items()}
+        self._rng = rng
+        self._before = self._values(self._points)
+
+    def is_invariant(self, axes: Sequence[Axis], count: int) -> bool:
+        """Whether all permutations of the labels do: those of two neighbours generate them."""
+        return all(self._is_same_with(axes, count, i) for i in range(count - 1))
+
+    def _is_same_with(self, axes: Sequence[Axis], count: int, label: int) -> bool:
+        """Whether the label and the next one may be exchanged."""
+        order = np.arange(count)
+        order[[label, label + 1]] = label + 1, label
+        points = dict(self._points)
+        for name, number in axes:
+            points[name] = np.take(points[name], order, axis=number + 1)
+        with np.errstate(invalid="ignore"):
+            change = self._values(points) - self._before
+        if not np.isfinite(change).all():
+            return False
+        error = change.std(axis=0, ddof=1) / len(change) ** 0.5 if len(change) > 1 else 0.0
+        rounding = ROUNDING * (10.0 + np.abs(self._before).max())
+        is_small = np.abs(change.mean(axis=0)) <= rounding + 4.0 * error
+        return bool(is_small.all() and np.max(error) <= MAX_ERROR)
+
+    def _values(self, points: Draws) -> Array:
+        """Log-densities of the points, a row for each noise."""
+        x = np.concatenate([values.reshape(N_POINTS, -1) for values in points.values()], axis=1)
+        n_noises = len(self._density.seed_names)
+        n_rows = N_SEEDS if n_noises else 1
+        seeds = self._rng.integers(np.iinfo(np.int64).max, size=(n_rows * N_POINTS, n_noises))
+        return self._density.evaluate(np.tile(x, (n_rows, 1)), seeds).reshape(n_rows, N_POINTS)
+
+
+def _found(model: pm.Model, draws: Draws, count: int, axes: tuple[Axis, ...], best: int) -> Labels:
+    ordered = tuple(axis.name for axis in axes if _keeps_order(model, draws, axis))
+    visited = 0.0 if ordered else _log_visited(_features(draws, axes), best)
+    return Labels(count, axes, float(gammaln(count + 1)) - visited, ordered)
+
+
+def _keeps_order(model: pm.Model, draws: Draws, axis: Axis) -> bool:
+    """Whether a transform keeps the draws in ascending order along an axis."""
+    is_sorted = (np.diff(draws[axis.name], axis=axis.number + 1) > 0.0).all()
+    return bool(is_sorted and is_restricted(model[axis.name], model))
+
+
+def _features(draws: Draws, axes: Sequence[Axis]) -> Array:
+    """What each draw says of each label, (draw, label, feature): of a matrix the diagonal."""
+    columns = []
+    for name in dict.fromkeys(axis.name for axis in axes):
+        numbers = [axis.number + 1 for axis in axes if axis.name == name]
+        values = np.moveaxis(draws[name], numbers, range(1, 1 + len(numbers)))
+        label = np.arange(values.shape[1])
+        own = values[(slice(None), *[label] * len(numbers))]
+        columns.append(own.reshape(*own.shape[:2], -1))
+    return np.concatenate(columns, axis=2)
+
+
+def _log_visited(features: Array, best: int) -> float:
+    """Logarithm of the number of orders that the draws visit, told by the draw of most density.
+
+    Labels that ever take each other's place are taken to visit all orders among themselves.
+    """
+    count, reference = features.shape[1], features[best]
+    scale = features.std(axis=(0, 1))
+    scale[scale == 0.0] = 1.0
+    chosen = features[:: -(-len(features) // N_ORDERED)]
+    distances = (((chosen[:, :, None] - reference) / scale) ** 2).sum(axis=-1)
+    share = np.zeros((count, count))
+    for one in distances:
+        share[linear_sum_assignment(one)] += 1.0 / len(distances)
+    _, group = connected_components(share > RARELY / count, directed=False)
+    return float(gammaln(np.bincount(group) + 1.0).sum())
+
+
+def _constant_potentials(model: pm.Model) -> float:
+    """The sum of the Potentials that depend on no variable of the model."""
+    variables = set(model.basic_RVs)
+    constant = [one for one in model.potentials if not variables & set(ancestors([one]))]
+    return float(sum(one.sum().eval(mode="FAST_COMPILE") for one in constant))
