@@ -14,7 +14,7 @@ from ..errors import ModelError
 from ..filters.protocol import Filter, properties
 from ..filters.recommendation import check_system_and_filter
 from ..ops.base import evaluator
-from ..ops.states import FilterRun, ResumableRun
+from ..ops.states import FilterRun, ResumableRun, States
 from ..system.clock import Clock
 from ..system.given_record import GivenRecord
 from ..system.model import StateSpaceModel
@@ -75,7 +75,9 @@ def run_filter(
         the covariance ``cov`` (time, state, state_bis). With EnKF and the particle filters also
         ``particles`` (time, particle, state) and ``weights`` (time, particle) before resampling;
         the weights sum to one; a particle that is not finite has weight zero, and where none is
-        finite mean and covariance are NaN. ``log_likelihood`` (obs_time) holds the terms
+        finite mean and covariance are NaN. With `FiniteStateFilter` the particles are all values of
+        the states, and ``most_probable_path`` (time, state) is the path of most probability given
+        all observations (Viterbi). ``log_likelihood`` (obs_time) holds the terms
         log p(d_j | d_1 .. d_{j-1}). From an observation at which the filter fails on, terms are
         -inf and states NaN. Of a panel, the dimension of the states is ``row`` instead of ``time``,
         with the coordinates ``record``, ``step`` and ``time`` of each row, the records one below
@@ -177,6 +179,10 @@ def run_filter(
     dataset = dataset.assign(log_likelihood=(term_dim, np.concatenate(terms)))
     if left:
         dataset = dataset.assign(stored(left, labels))
+    if properties(filter).finds_path:
+        evaluate = evaluator(States(system, filter, "most probable"))
+        paths = [evaluate(*each, own, 0)[0] for each, own in zip(arguments, rows, strict=True)]
+        dataset["most_probable_path"] = (row_dim, "state"), np.concatenate(paths)
     coords: dict[str, Any]
     if isinstance(table, CheckedRecord):
         coords = {row_dim: table.times(rows[0]), term_dim: table.times(at_steps[0])}

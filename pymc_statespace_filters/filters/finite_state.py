@@ -84,6 +84,7 @@ class FiniteStateFilter:
 
     noisy: ClassVar[bool] = False
     has_gradient: ClassVar[bool] = True
+    finds_path: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         given = {} if self.values is None else self.values
@@ -162,7 +163,7 @@ class FiniteStateFilter:
         return self._plan(system, BACKWARD if goes_back else FORWARD, leaves_tape=leaves_tape)
 
     def compile_states(self, system: System, moment: str) -> PlannedFunction:
-        """Compile "predicted", "filtered" or "smoothed" states; smoothed draws are paths."""
+        """Compile "predicted", "filtered", "smoothed" or "most probable" states."""
         plan = self._plan(system, STATES_OF_CHAIN, last_event=MOMENTS[moment])
         return PlannedFunction(plan, *STATES)
 

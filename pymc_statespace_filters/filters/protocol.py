@@ -159,12 +159,14 @@ class Properties(NamedTuple):
 
     It ``resumes`` if it has a plan and can go on from its state after earlier rows; its particles
     move by the rows to come if it ``needs_record_ahead``; and the mean of its estimates is the
-    likelihood, for any number of members, if it is ``unbiased``.
+    likelihood, for any number of members, if it is ``unbiased``. One that ``finds_path`` compiles
+    "most probable" states, too.
     """
 
     resumes: bool
     needs_record_ahead: bool
     unbiased: bool
+    finds_path: bool
 
 
 def properties(filter: Filter) -> Properties:

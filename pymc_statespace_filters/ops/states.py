@@ -12,7 +12,7 @@ class States(FilterOp):
     """Mean, sd and a draw of the state at steps ``wanted``, n_effective, and health.
 
     ``moment`` is "predicted" (given the observations at earlier steps than the row's), "filtered"
-    (also at the row's) or "smoothed" (all).
+    (also at the row's), "smoothed" (all), or "most probable" (the path that is, given all).
     """
 
     __props__ = ("system", "filter", "moment")

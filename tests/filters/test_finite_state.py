@@ -220,6 +220,38 @@ def test_run_shows_the_probability_of_every_state():
     np.testing.assert_allclose(run["mean"].values, states("filtered", [0])[0], rtol=1e-12)
 
 
+@pytest.mark.parametrize("at", ["steps", "observations"])
+def test_the_most_probable_path_is_that_of_all(at):
+    """Where two paths are about as probable, the paths at single steps are another one."""
+    paths, log_p = switch_paths(**GIVEN, **RECORD)
+    rows = slice(None) if at == "steps" else RECORD["steps"]
+    run = psf.run_filter(SWITCH, psf.FiniteStateFilter(), GIVEN, at=at, **RECORD)
+    best = paths[np.argmax(log_p)]
+    found = run["most_probable_path"].sel(state=["regime", "before"]).values
+    assert found[:, 0].tolist() == best[rows].tolist()
+    assert found[:, 1].tolist() == np.append(0, best[:-1])[rows].tolist()
+
+
+def test_the_most_probable_path_where_moves_are_impossible():
+    """Of two records, one of which fails."""
+    observed = np.concatenate([COUNTS["observed"], [0.0, -1.0]])
+    steps, panel = [*COUNTS["steps"], 0, 1], [*"aaaaaa", *"bb"]
+    with pytest.warns(psf.errors.FilterWarning):
+        run = psf.run_filter(
+            WEAR, psf.FiniteStateFilter(), WORN, observed, steps=steps, panel=panel, at="steps"
+        )
+    probabilities = {}
+    for path in itertools.product(range(3), repeat=9):
+        ups = [WORN["p"][0] * (1 + i) if i < 2 else 0.0 for i in range(3)]
+        stays = [{0: 1 - ups[i], 1: ups[i]}.get(j - i, 0.0) for i, j in itertools.pairwise(path)]
+        seen = zip(COUNTS["steps"], COUNTS["observed"], strict=True)
+        density = [poisson.pmf(d, 0.1 + 1.5 * path[k]) for k, d in seen if not np.isnan(d)]
+        probabilities[path] = (path[0] == 0) * np.prod(stays) * np.prod(density)
+    found = run["most_probable_path"].values[:, 0]
+    assert tuple(found[:9]) == max(probabilities, key=probabilities.get)
+    assert np.isnan(found[9:]).all()
+
+
 def test_panel_and_many_points():
     """Records and points have the terms and the gradient that they have alone."""
     filter = psf.FiniteStateFilter()

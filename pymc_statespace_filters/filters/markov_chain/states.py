@@ -20,9 +20,15 @@ from ..outcomes import NONE, OUT_OF_MEMORY, is_missing
 from ..plan import PLAN
 from .forward import forward_pass, rows_on_tape
 from .machine import move_probabilities, read_chain, room_for_moves
+from .most_probable_path import most_probable_path
 
-PREDICTED, FILTERED, SMOOTHED = range(3)
-MOMENTS = {"predicted": PREDICTED, "filtered": FILTERED, "smoothed": SMOOTHED}
+PREDICTED, FILTERED, SMOOTHED, MOST_PROBABLE = range(4)
+MOMENTS = {
+    "predicted": PREDICTED,
+    "filtered": FILTERED,
+    "smoothed": SMOOTHED,
+    "most probable": MOST_PROBABLE,
+}
 
 
 @njit_internal
@@ -112,6 +118,16 @@ def _read_backwards(chain, record, tape, n_taped, rows, seed, probabilities, pat
 
 
 @njit_internal
+def _read_path(chain, record, tape, rows, probabilities, paths):
+    """Write the most probable path, whose states have probability one."""
+    path = most_probable_path(chain, record, tape)
+    for r in range(min(rows.size, np.searchsorted(rows, path.size))):
+        paths[r] = path[rows[r]]
+        probabilities[r, :] = 0.0
+        probabilities[r, paths[r]] = 1.0
+
+
+@njit_internal
 def _probabilities(call, rows, moment, paths):
     """The chain, and probabilities (R, K) of its states at the rows: NaN where unknown."""
     to, J = call.results, call.record[RECORD.n_rows]
@@ -132,6 +148,9 @@ def _probabilities(call, rows, moment, paths):
     if moment == SMOOTHED:
         if code == NONE:
             _read_backwards(chain, record, tape, end, rows, seed, probabilities, paths)
+    elif moment == MOST_PROBABLE:
+        if code == NONE:
+            _read_path(chain, record, tape, rows, probabilities, paths)
     else:
         known = first_unknown(call, health)
         _read_forwards(chain, record, tape, rows, known, moment, seed, probabilities, paths)
