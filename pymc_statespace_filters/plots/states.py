@@ -9,6 +9,7 @@ from arviz_plots import PlotCollection
 from ..errors import ModelError
 from ..system.checks import check_count
 from .canvas import add_legend, curve, label_axes, time_label
+from .finite import draw_ribbons, is_continuous, ribbons
 from .marks import (
     DOTS,
     DRAWS,
@@ -61,7 +62,8 @@ def plot_states(
 
     Bands contain 50 % and 90 % of the draws, which include the uncertainty of the parameters; the
     line is their median. States at no more than 200 observation times are shown as bars. Failed
-    draws are ignored; where all failed there is a gap.
+    draws are ignored; where all failed there is a gap. A state that takes a few values, as a
+    regime, has a ribbon along each value instead, as thick as its probability.
 
     The path of `simulate` is shown as a line, and each observable that is no state in a panel of
     its own.
@@ -107,7 +109,8 @@ def plot_states(
     -------
     arviz_plots.PlotCollection
         Visuals ``band_90``, ``band_50`` and ``median`` (or ``bar_90`` and ``bar_50``), ``data``,
-        ``truth``, ``draws``, along ``state``; of a simulation ``path`` and ``data``.
+        ``truth``, ``draws``, and ``probability`` of states that take a few values, along ``state``;
+        of a simulation ``path`` and ``data``.
 
     Raises
     ------
@@ -153,7 +156,13 @@ def plot_states(
     # Bands below the points, lines above them.
     as_bars = at_observations and data.sizes["time"] <= FEW
     quantiles = over_draws(data) if as_bars else facets.connected(over_draws(data))
-    bands = (draw_bars if as_bars else draw_bands)(collection, quantiles)
+    edges = ribbons(data["states"])
+    bands: dict[str, Any] = {}
+    if edges is not None:
+        quantiles = quantiles.where(is_continuous(edges))
+        bands = draw_ribbons(collection, facets.connected(edges))
+    if has_bands := bool(edges is None or is_continuous(edges).any()):
+        bands |= (draw_bars if as_bars else draw_bands)(collection, quantiles)
     if n_draws:
         mark, style = (paths, PATHS) if are_paths else (points, DOTS)
         collection.map(mark, "draws", data=thin_draws(data, n_draws), **style)
@@ -161,7 +170,7 @@ def plot_states(
     if record is not None and set(shown) & set(measured):
         record = transformed(record, "observable", functions)
         legend = draw_data(collection, observations_of(record, measured, shown))
-    lines = {} if as_bars else draw_median(collection, quantiles)
+    lines = draw_median(collection, quantiles) if has_bands and not as_bars else {}
     if true is not None:
         collection.map(curve, "truth", data=true.to_dataset(name="truth"), **TRUTH)
         legend = {"truth": TRUTH} | legend

@@ -64,6 +64,32 @@ def test_a_state_without_draws_for_a_while_has_a_gap():
     )
 
 
+def test_a_regime_has_ribbons_as_thick_as_its_probability():
+    """Beside a continuous state; the first regime has no draw at the first time."""
+    rng = np.random.default_rng(1)
+    regime = (rng.uniform(size=(2, 50, 6)) < np.linspace(1, 0.2, 6)).astype(float)
+    values = np.stack([regime, rng.standard_normal((2, 50, 6))], axis=-1)
+    group = xr.Dataset(
+        {"d_states": (("chain", "draw", "d_time", "state"), values)},
+        coords={"d_time": np.arange(6.0), "state": ["regime", "speed"]},
+    )
+    collection = plot_states(
+        xr.DataTree.from_dict({"smoothed_states": group}), truth=values[0, 0], backend="none"
+    )
+    ribbon = drawn(collection, "probability")["regime"]
+    np.testing.assert_allclose(ribbon["y_top"] - 1, 0.45 * regime.mean(axis=(0, 1)))
+    np.testing.assert_allclose(ribbon["y_bottom"] + ribbon["y_top"], 2.0)
+    band = drawn(collection, "band_90")
+    assert band["regime"] is None
+    assert band["speed"] is not None
+    for backend in ("matplotlib", "plotly", "bokeh"):
+        plot_states(xr.DataTree.from_dict({"smoothed_states": group}), backend=backend)
+        alone = plot_states(
+            xr.DataTree.from_dict({"smoothed_states": group}), states="regime", backend=backend
+        )
+        assert "band_90" not in alone.viz.children
+
+
 def test_draws_are_paths_if_smoothed_and_points_if_filtered(states):
     paths = drawn(plot_states(states, n_draws=3, backend="none"), "draws")["speed"]
     assert paths["function"] == "line"
