@@ -100,7 +100,7 @@ def uncounted_orders(model: pm.Model, found: Sequence[Labels]) -> Iterator[str]:
             yield (
                 f"the {one.count} labels of {names} may be exchanged and {why}, so that the "
                 f"log-evidence lacks ln {orders:.0f} = {one.lacking:.3f}: add it, or give the "
-                f"model pm.Potential('orders', np.log({orders:.1f})) before it is sampled"
+                f"model pm.Potential('orders', pm.math.log({orders:.1f})) before it is sampled"
             )
 
 

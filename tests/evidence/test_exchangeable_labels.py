@@ -51,7 +51,7 @@ def mixture(prior_means=(0.0, 0.0), transform=None, orders=1):
         of_each = [pm.logp(pm.Normal.dist(mu[k], 1), DATA) - np.log(2) for k in range(2)]
         pm.Potential("likelihood", pt.logaddexp(*of_each).sum())
         if orders > 1:
-            pm.Potential("orders", np.log(float(orders)))
+            pm.Potential("orders", pm.math.log(float(orders)))
     return model
 
 
