@@ -18,7 +18,7 @@ from ..filters.recommendation import short_form
 from ..filters.signatures import PANEL
 from ..ops.base import evaluator
 from ..ops.likelihood import LogLikelihood
-from ..system.panel_records import N_COLUMNS, RECORD, STEP
+from ..system.panel_records import FIRST_INPUT, N_COLUMNS, RECORD, STEP, records_of
 from .density import RowFunction, check_free_variables
 from .inspection import scored_rows, state_space_nodes
 from .random_variable import draw_in_python
@@ -55,9 +55,12 @@ class ScoredVariable:
     Attributes
     ----------
     system, filter, clock
-    steps : ndarray (J,)
+    records : Records
+    t0 : ndarray ()
     of_rows : ndarray (J,)
         The number of the record of each row.
+    times : ndarray (J,)
+        The model time of each row; `t0` is that of step 0.
     observed : ndarray (J, p)
     """
 
@@ -70,13 +73,12 @@ class ScoredVariable:
         theta, *record = model.replace_rvs_by_values(list(node.inputs[-5:-1]))
         self._values = [model.rvs_to_values[rv] for rv in model.free_RVs]
         _check_record(name, record, self._values)
-        table, self._inputs, self._t0 = (graph.eval(mode="FAST_COMPILE") for graph in record)
+        table, self._inputs, self.t0 = (graph.eval(mode="FAST_COMPILE") for graph in record)
         self.is_panel = table.ndim == 2
         self._arguments = table
         self._rows = table if self.is_panel else _rows(table)
-        self.steps = self._rows[:, STEP]
-        codes = self._rows[:, RECORD]
-        self.of_rows = np.cumsum(np.diff(codes, prepend=codes[0]) != 0)
+        self.records = records_of(self._rows[:, RECORD])
+        self.of_rows = self.records.of_rows()
         observed = model.rvs_to_values[node.outputs[1]]
         self.observed = np.asarray(observed.eval(mode="FAST_COMPILE"), dtype=np.float64)
         self._evaluate = evaluator(LogLikelihood(self.system, self.filter, PANEL))
@@ -89,7 +91,16 @@ class ScoredVariable:
     @property
     def n_records(self) -> int:
         """Number of records of a panel, or one."""
-        return int(self.of_rows[-1]) + 1
+        return len(self.records.labels)
+
+    @property
+    def times(self) -> Array:
+        """The model time of each row (J,)."""
+        system, steps = self.system, self._rows[:, STEP]
+        if not system.is_at_any_times:
+            return np.asarray(self.t0 + steps * system.dt, dtype=np.float64)
+        starts = self._inputs[:, system.n_inputs + 1]
+        return np.asarray(starts[self._rows[:, FIRST_INPUT] + steps])
 
     @property
     def labels(self) -> list[str]:
@@ -122,7 +133,7 @@ class ScoredVariable:
     def simulate(self, x: Array, count: int, rng: np.random.Generator) -> Array:
         """Data sets (count, J, p) at a point x (k_x,), missing where the data are."""
         theta = self.theta(x[None])[0]
-        record = self._arguments, self._inputs, self._t0, 0, None
+        record = self._arguments, self._inputs, self.t0, 0, None
         own = theta if self.is_panel else theta[0]
         found = np.stack([draw_in_python(self._op, rng, own, *record) for _ in range(count)])
         return np.where(np.isnan(self.observed), np.nan, found)
@@ -134,7 +145,7 @@ class ScoredVariable:
         records = np.add.outer(np.arange(m) * self.n_records, self.of_rows)
         table[:, RECORD] = records.ravel()
         below = theta.reshape(-1, theta.shape[-1]), table, observed.reshape(m * n_rows, -1)
-        found = self._evaluate(*below, self._inputs, self._t0, np.asarray(0))[0]
+        found = self._evaluate(*below, self._inputs, self.t0, np.asarray(0))[0]
         kept = np.zeros(n_rows)
         kept[self._scored] = 1.0
         return np.asarray(found.reshape(m, n_rows) * kept)

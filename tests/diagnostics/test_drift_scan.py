@@ -3,6 +3,7 @@
 from functools import cache
 
 import numpy as np
+import pandas as pd
 import pymc as pm
 import pytest
 from scipy.stats import kstest
@@ -13,7 +14,7 @@ from pymc_statespace_filters.diagnostics.constancy.simulations import ConstancyT
 from pymc_statespace_filters.diagnostics.constancy.statistics import constancy, p_values
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.pymc_model.term_scores import ScoredVariable
-from tests.systems import driven, driven_by_wandering_gain
+from tests.systems import DUFFING, driven, driven_by_wandering_gain
 
 N_ROWS = 100
 FORCE = np.random.default_rng(0).normal(size=(N_ROWS, 1))
@@ -164,6 +165,46 @@ def test_the_record_of_a_panel_that_changes_is_named():
     assert abs(first["time"] - 61) <= 8
     assert "in record 'B'" in repr(scan).replace("\n ", "")
     assert scan.paths.sizes["row"] == 3 * N_ROWS
+
+
+def time_axis(model):
+    return TimeAxis.of(model, ScoredVariable(model, "d"))
+
+
+def test_times_of_a_panel_are_dates_since_the_start_of_each_record():
+    dates = pd.to_datetime(["2024-01-03", "2024-01-05", "2025-03-02", "2025-03-03"])
+    record = {"steps": None, "times": dates, "unit": "D", "t0": 1, "panel": ["A", "A", "B", "B"]}
+    axis = time_axis(driven_model([0.1, 0.2, np.nan, 0.4], **record))
+    np.testing.assert_array_equal(axis.shown, dates)
+    np.testing.assert_allclose(axis.durations, [0, 2, 0, 1])
+    assert axis.labels == ["A", "B"]
+
+
+def test_times_of_a_panel_off_the_grid():
+    times = [0.313, 0.511, 0.257]
+    with pm.Model() as model:
+        k = pm.LogNormal("k", 0, 1)
+        psf.StateSpace(
+            "d", DUFFING, psf.EKF(), panel=["A", "A", "B"], times=times, observed=np.zeros((3, 2)),
+            params={"k": k, "c": 0.3, "s": 0.5, "b": 0.1, "r": 0.1, "m": 0.0, "v": 1.0},
+        )  # fmt: skip
+    axis = time_axis(model)
+    np.testing.assert_allclose(axis.shown, times)
+    np.testing.assert_allclose(axis.durations, [0.313, 0.198, 0.257])
+
+
+def test_times_of_a_panel_whose_rows_are_data():
+    with pm.Model() as model:
+        gain = pm.Normal("gain", 0, 2)
+        psf.StateSpace(
+            "d", driven(), psf.EKF(), panel=pm.Data("panel", [3, 3, 7]), inputs=FORCE,
+            steps=pm.Data("steps", [1, 4, 2]), observed=[0.1, 0.2, 0.3],
+            params={"a": 0.7, "gain": gain, "sigma": 0.3},
+        )  # fmt: skip
+    axis = time_axis(model)
+    np.testing.assert_allclose(axis.shown, [1, 4, 2])
+    np.testing.assert_allclose(axis.durations, [1, 3, 2])
+    assert axis.labels == [3, 7]
 
 
 def test_chosen_parameters():

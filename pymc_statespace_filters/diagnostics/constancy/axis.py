@@ -30,23 +30,17 @@ class TimeAxis(NamedTuple):
     @classmethod
     def of(cls, model: pm.Model, variable: ScoredVariable) -> "TimeAxis":
         """That of a variable of a model."""
-        name = variable.name
-        row_dim = model.named_vars_to_dims[name][0]
-        if variable.is_panel:
-            times = model[f"{name}_time"].get_value()
-            labels = list(model.coords[f"{name}_record"])
-        else:
-            times, labels = np.asarray(model.coords[row_dim]), [None]
-        shown = variable.clock.shown(times) if variable.is_panel else times
-        if not np.issubdtype(times.dtype, np.number):
-            times = (times - times[0]) / np.timedelta64(1, "s")
-        return cls(shown, _durations(times.astype(float), variable), labels, variable.of_rows)
+        times, of_rows = variable.times, variable.of_rows
+        is_first = np.diff(of_rows, prepend=-1) > 0
+        durations = np.where(is_first, times - variable.t0, np.diff(times, prepend=0.0))
+        parts = enumerate(variable.records.split(times))
+        shown = np.concatenate([variable.clock.shown(own, number) for number, own in parts])
+        return cls(shown, durations, _labels(model, variable), of_rows)
 
 
-def _durations(times: Array, variable: ScoredVariable) -> Array:
-    """Times since the row before; of the first row of a record since its step 0."""
-    steps, firsts = variable.steps, np.diff(variable.of_rows, prepend=-1) > 0
-    durations, n_steps = np.diff(times, prepend=0.0), np.diff(steps, prepend=0)
-    inside = ~firsts & (n_steps > 0)
-    length = durations[inside].sum() / n_steps[inside].sum() if inside.any() else 1.0
-    return np.where(firsts, steps * length, durations)
+def _labels(model: pm.Model, variable: ScoredVariable) -> list[Any]:
+    if not variable.is_panel:
+        return [None]
+    labels = list(model.coords[f"{variable.name}_record"])
+    # The rows may have been set to those of other records.
+    return labels if len(labels) == variable.n_records else variable.records.labels

@@ -100,7 +100,7 @@ class ConstancyTest:
         return simulated[possible]
 
     def _blocks(self, simulated: Array) -> list[Array]:
-        n_numbers = len(self.variable.steps) * (self.mode.x.shape[1] + len(self._scale))
+        n_numbers = len(self.variable.of_rows) * (self.mode.x.shape[1] + len(self._scale))
         size = max(1, BLOCK_SIZE // n_numbers)
         return [simulated[begin : begin + size] for begin in range(0, len(simulated), size)]
 
