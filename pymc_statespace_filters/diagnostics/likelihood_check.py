@@ -50,8 +50,8 @@ def check_filter(
     too low, so that draws cannot show it. Of these points those count at which the posterior would
     be as high as at the draws.
 
-    `sample_dram` and `run_models` make the same check at their end, with two seconds or a tenth of
-    the run's time.
+    All samplers of this package make the same check at the end of a run, with two seconds or a
+    tenth of the run's time.
 
     Parameters
     ----------

@@ -169,6 +169,21 @@ def store(idata: xr.DataTree, outcomes: Mapping[str, Mapping[str, str]]) -> None
     idata.attrs[ATTRIBUTE] = json.dumps(outcomes)
 
 
+def kept(former: xr.DataTree, filter: Filter) -> dict[str, dict[str, str]]:
+    """The outcomes of a result that hold for further rows, which went through this filter.
+
+    That it is off, and that there is nothing to compare; no sign in some rows says nothing of more.
+    """
+    found = {}
+    for name, one in json.loads(former.attrs.get(ATTRIBUTE, "{}")).items():
+        if one["outcome"] == EXACT:  # for any number of members
+            verdict = _plain_row(filter).verdict
+            found[name] = {"filter": short_form(filter), "outcome": EXACT, "verdict": verdict}
+        elif one["outcome"] == OFF and one["filter"] == short_form(filter):
+            found[name] = one
+    return found
+
+
 def stored(idata: xr.DataTree, model: pm.Model, outcome: str) -> list[str]:
     """The verdicts, stored with the draws, on filters that the model has and have this outcome."""
     found = json.loads(idata.attrs.get(ATTRIBUTE, "{}"))

@@ -17,6 +17,7 @@ from ..system.input_columns import inputs_of_user
 from ..system.placement import Earlier
 from ..system.record import CheckedRecord, check_observed, checked_record
 from ..system.steps import GRID_TOLERANCE, check_steps
+from .filter_doubts import kept_from
 from .observed_rows import ObservedRows
 from .sequential_output import finished
 from .stored_run import restored
@@ -61,7 +62,8 @@ def extend(
     -------
     xarray.DataTree
         As that of `sample_smc`, of all rows. States and forecasts at its draws need a model of all
-        rows.
+        rows. The filter is not checked again: ``attrs["filter_check"]`` keeps that it was found to
+        be off, and drops that there was no sign of it in the rows before.
 
     Raises
     ------
@@ -74,9 +76,12 @@ def extend(
     -----
     EvidenceWarning
         As `sample_smc`.
+    FilterWarning
+        If the filter was found to be off before.
 
     See Also
     --------
+    check_filter : Compare the filter with an unbiased one over all rows.
     run_filter : The same at fixed parameters, with ``state=``.
 
     Notes
@@ -116,7 +121,7 @@ def extend(
         request = request._replace(entropy=tuple(entropy))
     progress = progress._replace(rows=rows.with_record(record))
     with COMPILATION:
-        return finished(progress, request, progressbar=progressbar)
+        return finished(progress, request, kept_from(idata), progressbar=progressbar)
 
 
 def _new_rows(

@@ -6,7 +6,7 @@ takes draws of a posterior takes these.
 """
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import pymc as pm
@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from ..errors import EvidenceWarning
 from ..evidence.evidence import Evidence, store_evidence
 from ..evidence.posterior import Observed, count_of, fingerprint_of
+from ..filters.protocol import Filter
 from ..importance import normalised
+from ..pymc_model.held_seed import INSIDE
 from ..pymc_model.inspection import exactness, filters_used, noise_seeds
 from ..pymc_model.prior import Support
 from ..sampling.output.datatree import to_datatree
@@ -33,6 +35,8 @@ MIN_ACCEPTANCE = 0.02
 _DRAWS = 2**32  # key of random numbers beside those of the run
 
 Array = NDArray[np.float64]
+# Of a result, the filter that the run has used (None: those of the model) and its seconds.
+DoubtsOf = Callable[[xr.DataTree, Filter | None, float], Sequence[str]]
 
 
 def as_datatree(
@@ -44,11 +48,13 @@ def as_datatree(
     data: str,
     seconds: float,
     maximum: float,
+    doubts_of: DoubtsOf,
+    filter: Filter | None = None,
 ) -> xr.DataTree:
     """The result of a run of a model with the data ``observed``.
 
     ``maximum`` is the largest log-likelihood found, of the evidence; ``data`` is the way in which
-    the data came in.
+    the data came in; ``doubts_of`` gives the doubts about filters.
 
     Warns
     -----
@@ -79,15 +85,18 @@ def as_datatree(
         "log_evidence": merged,
         "log_evidence_se": error,
     }
-    evidence = _evidence(model, merged, error, run, observed, maximum)
-    store_evidence(tree, evidence, {"n_populations": float(request.n_populations)})
-    if evidence.doubts:
+    support = Support.of(model)
+    doubts = [*support.check(), *_doubts(run)]
+    if doubts:
         warnings.warn(
             f"the log-evidence {merged:.2f} is less certain than its standard error suggests: "
-            f"{evidence.doubts}",
+            f"{'; '.join(doubts)}",
             EvidenceWarning,
-            stacklevel=4,
+            skip_file_prefixes=INSIDE,
         )
+    doubts += doubts_of(tree, filter, seconds)
+    evidence = _evidence(model, support, (merged, error), run, observed, maximum, doubts)
+    store_evidence(tree, evidence, {"n_populations": float(request.n_populations)})
     return tree
 
 
@@ -116,23 +125,22 @@ def _errors(tree: xr.DataTree, values: dict[str, np.ndarray], run: Run) -> xr.Da
 
 def _evidence(
     model: pm.Model,
-    value: float,
-    error: float,
+    support: Support,
+    value_and_error: tuple[float, float],
     run: Run,
     observed: Sequence[Observed],
     maximum: float,
+    doubts: Sequence[str],
 ) -> Evidence:
-    support = Support.of(model)
     return Evidence(
-        value,
-        error,
+        *value_and_error,
         ESTIMATOR,
         n_parameters=run.cloud.others.particles.x.shape[1],
         n_observations=count_of(observed),
         max_log_likelihood=maximum,
         data_fingerprint=fingerprint_of(observed),
         noise="refreshed" if noise_seeds(model) else "none",
-        doubts="; ".join([*support.check(), *_doubts(run)]),
+        doubts="; ".join(doubts),
         log_volume=support.log_volume,
         uniform=support.uniform,
         improper=support.improper,

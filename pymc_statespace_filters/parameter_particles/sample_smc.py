@@ -15,8 +15,9 @@ from ..progress import stage_progress
 from ..pymc_model.inspection import given_model
 from ..pymc_model.prior import ModelFactors
 from ..system.checks import check_flag, check_random_seed
+from .filter_doubts import checked_at_end, not_checked
 from .observed_rows import ObservedRows
-from .output import as_datatree
+from .output import DoubtsOf, as_datatree
 from .request import Request, Run, checked_request
 from .sequential_output import finished
 from .sequential_run import Progress
@@ -34,6 +35,7 @@ def sample_smc(
     waste_free: bool = True,
     random_seed: int | np.random.Generator | None = None,
     progressbar: bool = True,
+    compute_convergence_checks: bool = True,
 ) -> xr.DataTree:
     r"""Draw from a posterior by sequential Monte Carlo over its parameters, with the evidence.
 
@@ -64,6 +66,9 @@ def sample_smc(
         Seed, of which the result is a function, on any number of threads.
     progressbar : bool
         Whether to show the stage, its effective size and acceptance, after two seconds.
+    compute_convergence_checks : bool
+        Whether to compare filters that are not exact with unbiased ones at the end, if there are
+        600 particles or more; see `check_filter`. Ctrl-C ends the comparison without an outcome.
 
     Returns
     -------
@@ -81,7 +86,8 @@ def sample_smc(
         ``acceptance``, ``n_members`` of the filter, ``variance`` of the log-likelihood where it was
         measured, and ``n_updates`` of filters. ``evidence`` holds the evidence, as
         `estimate_evidence` stores it, with the estimator "smc"; the attributes ``log_evidence`` and
-        ``log_evidence_se`` repeat it. ``smc_state``, of "sequential", is what `extend` goes on
+        ``log_evidence_se`` repeat it, and ``filter_check``, a JSON text, has the outcome of the
+        comparison of filters. ``smc_state``, of "sequential", is what `extend` goes on
         from.
 
     Raises
@@ -97,13 +103,14 @@ def sample_smc(
     EvidenceWarning
         If the evidences of the populations differ so much that a few decide, if moves are rarely
         accepted, or if a prior is not normalised.
+    FilterWarning
+        If a filter is found to be off; the evidence keeps this doubt.
 
     See Also
     --------
     extend : More rows for a sequential run.
     sample : Chains, which take fewer evaluations for one posterior.
     estimate_evidence : The evidence from draws of any sampler.
-    plot_prequential : Which rows speak for which model.
     plot_prequential : Which rows speak for which model.
 
     Notes
@@ -145,12 +152,18 @@ def sample_smc(
     rng = check_random_seed(random_seed)
     entropy = tuple(rng.integers(2**63, size=2).tolist())
     request = checked_request(model, draws, populations, waste_free, entropy)
+    check_flag("progressbar", progressbar)
+    doubts_of: DoubtsOf = not_checked
+    if check_flag("compute_convergence_checks", compute_convergence_checks):
+        doubts_of = checked_at_end(model, request, progressbar=progressbar)
     with COMPILATION:
         run = _tempered if data == "tempered" else _sequential
-        return run(model, request, check_flag("progressbar", progressbar))
+        return run(model, request, doubts_of, progressbar)
 
 
-def _tempered(model: pm.Model, request: Request, progressbar: bool) -> xr.DataTree:
+def _tempered(
+    model: pm.Model, request: Request, doubts_of: DoubtsOf, progressbar: bool
+) -> xr.DataTree:
     began, likelihood = perf_counter(), WholeLikelihood(model)
     with stage_progress(1.0, enabled=progressbar) as show:
         run = tempered_run(model, likelihood, request, show)
@@ -158,13 +171,16 @@ def _tempered(model: pm.Model, request: Request, progressbar: bool) -> xr.DataTr
     seconds = perf_counter() - began
     observed = observed_in(model)
     return as_datatree(
-        model, run, request, observed, data="tempered", seconds=seconds, maximum=maximum
-    )
+        model, run, request, observed, data="tempered", seconds=seconds, maximum=maximum,
+        doubts_of=doubts_of,
+    )  # fmt: skip
 
 
-def _sequential(model: pm.Model, request: Request, progressbar: bool) -> xr.DataTree:
-    rows = ObservedRows.of(model)
-    return finished(Progress.before_any_row(rows, request), request, progressbar=progressbar)
+def _sequential(
+    model: pm.Model, request: Request, doubts_of: DoubtsOf, progressbar: bool
+) -> xr.DataTree:
+    begin = Progress.before_any_row(ObservedRows.of(model), request)
+    return finished(begin, request, doubts_of, progressbar=progressbar)
 
 
 def _maximum(factors: ModelFactors, run: Run, request: Request) -> float:

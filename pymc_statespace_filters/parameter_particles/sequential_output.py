@@ -10,13 +10,15 @@ from ..evidence.posterior import Observed
 from ..filters.recommendation import short_form
 from ..progress import stage_progress
 from .observed_rows import ObservedRows
-from .output import COURSE, as_datatree
+from .output import COURSE, DoubtsOf, as_datatree
 from .request import Request
 from .sequential_run import Progress, advance
 from .stored_run import GROUP, stored
 
 
-def finished(progress: Progress, request: Request, *, progressbar: bool) -> xr.DataTree:
+def finished(
+    progress: Progress, request: Request, doubts_of: DoubtsOf, *, progressbar: bool
+) -> xr.DataTree:
     """The result of a run that is led through all rows of its record."""
     began, n_rows = perf_counter(), len(progress.rows.record.steps)
     with stage_progress(n_rows, enabled=progressbar) as show:
@@ -32,6 +34,8 @@ def finished(progress: Progress, request: Request, *, progressbar: bool) -> xr.D
         seconds=perf_counter() - began,
         # With noise the largest of many estimates says nothing of the maximum.
         maximum=np.nan if rows.filter.noisy else float(likelihood.max()),
+        doubts_of=doubts_of,
+        filter=rows.filter,
     )
     name, dims = rows.variable.name, rows.variable.dims
     # The filter may have more members than that of the model, and the record more rows.

@@ -7,6 +7,7 @@ import xarray as xr
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.parameter_particles import output
 from pymc_statespace_filters.pymc_model.density import ModelDensity
 from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
 from tests.parameter_particles.autoregression import DATA, STEPS, exact, model
@@ -175,6 +176,22 @@ def test_data_that_do_not_come_row_by_row_are_refused():
             "d", FORCED, psf.EKF(), steps=STEPS, observed=DATA, inputs=a * np.ones((24, 1))
         )
     refused("inputs that do not depend", moving)
+
+
+def test_doubts_of_the_evidence_point_at_the_call(monkeypatch):
+    monkeypatch.setattr(output, "MAX_SPREAD", 0.0)
+    built, more = model(psf.EKF(), 3), {"observed": DATA[3:4], "steps": STEPS[3:4]}
+    settings = SETTINGS | {"draws": 20, "populations": 2, "model": built}
+
+    def warned(call, *arguments, **named):
+        with pytest.warns(psf.errors.EvidenceWarning, match="a few of them decide") as caught:
+            found = call(*arguments, **named)
+        assert [one.filename for one in caught] == [__file__]
+        return found
+
+    first = warned(psf.sample_smc, **settings)
+    warned(psf.extend, first, built, progressbar=False, **more)
+    warned(psf.sample_smc, **settings | {"data": "tempered"})
 
 
 def test_a_score_counts_from_a_row_on():

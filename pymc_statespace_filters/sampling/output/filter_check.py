@@ -13,6 +13,7 @@ from xarray import DataTree
 from ...errors import FilterWarning, StateSpaceFiltersError
 from ...filter_checks.checks import check_model, outcomes_of, store
 from ...filter_checks.finding import EXACT, OFF
+from ...filters.protocol import Filter
 from ...pymc_model.inspection import observes_state_space
 from ...pymc_model.posterior_draws import MIN_DRAWS
 
@@ -43,11 +44,17 @@ def warn_of_filters(texts: Sequence[str]) -> None:
 
 
 def check_filters(
-    tree: DataTree, model: Model, n_iterations: int, seconds: float, rng: np.random.Generator
+    tree: DataTree,
+    model: Model,
+    n_iterations: int,
+    seconds: float,
+    rng: np.random.Generator,
+    filter: Filter | None = None,
 ) -> FilterCheck:
     """Check the filters at the draws of a run that took so many seconds; see `check_filter`.
 
-    The outcome is stored with the draws.
+    The outcome is stored with the draws. ``filter`` is the one that the run has used, if it is not
+    that of the model.
     """
     n_draws = tree["posterior"].sizes["draw"]
     if not observes_state_space(model) or n_draws < MIN_DRAWS or n_iterations < _LEAST_ITERATIONS:
@@ -56,7 +63,7 @@ def check_filters(
         table = check_model(
             tree,
             model,
-            filter=None,
+            filter=filter,
             n_points=_N_POINTS,
             seconds=max(_LEAST_SECONDS, _SHARE * seconds),
             rng=rng,

@@ -1,0 +1,103 @@
+"""Masses by `sample_smc`, within their errors or not, of modes apart, a banana and a funnel.
+
+The targets are distributions of known masses and evidence 1: the likelihood of each is its density
+over that of a wide prior. A run that is off by more than 3 of its errors should be marked by an
+`EvidenceWarning`. Run it with ``python -m benchmarks.smc 20`` from the root of the repository, for
+20 seeds.
+"""
+
+import sys
+import time
+import warnings
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+from scipy.stats import norm
+
+import pymc_statespace_filters as psf
+
+DRAWS = 200, 1000
+PRIOR_SD = 10.0
+
+
+def with_target(dim, log_density, parts) -> pm.Model:
+    """A model whose posterior has this density, with the indicator of each part."""
+    with pm.Model() as model:
+        x = pm.Normal("x", 0.0, PRIOR_SD, shape=dim)
+        prior = pm.logp(pm.Normal.dist(0.0, PRIOR_SD), x).sum()
+        pm.Potential("likelihood", log_density(x) - prior)
+        for name, is_inside in parts.items():
+            pm.Deterministic(name, pt.cast(is_inside(x), "float64"))
+    return model
+
+
+def normal(x, mean, sd):
+    return pm.logp(pm.Normal.dist(mean, sd), x).sum()
+
+
+def wells() -> tuple[pm.Model, dict[str, float]]:
+    """Two wells in two dimensions, 8 of the wider one's standard deviations apart."""
+
+    def log_density(x):
+        wide, narrow = normal(x, [-4.0, 0.0], 1.0), normal(x, [4.0, 0.0], 0.3)
+        return pt.logaddexp(np.log(0.7) + wide, np.log(0.3) + narrow)
+
+    return with_target(2, log_density, {"narrow": lambda x: x[0] > 0.0}), {"narrow": 0.3}
+
+
+def banana() -> tuple[pm.Model, dict[str, float]]:
+    """A ridge along a parabola, a hundredth as wide as long."""
+
+    def log_density(x):
+        return normal(x[0], 0.0, 2.0) + normal(x[1], 0.5 * x[0] ** 2, 0.04)
+
+    parts = {"left": lambda x: x[0] < 0.0, "ends": lambda x: abs(x[0]) > 3.0}
+    return with_target(2, log_density, parts), {"left": 0.5, "ends": 2 * norm.sf(1.5)}
+
+
+def funnel() -> tuple[pm.Model, dict[str, float]]:
+    """Neal's, with five variables whose scale is the exponential of half of the first."""
+
+    def log_density(x):
+        return normal(x[0], 0.0, 3.0) + normal(x[1:], 0.0, pt.exp(x[0] / 2))
+
+    parts = {"neck": lambda x: x[0] < -3.0, "mouth": lambda x: x[0] > 3.0}
+    return with_target(6, log_density, parts), {"neck": norm.sf(1.0), "mouth": norm.sf(1.0)}
+
+
+def run(model: pm.Model, exact: dict[str, float], draws: int, seed: int) -> dict[str, float]:
+    """Errors of masses and log-evidence in units of their standard errors; whether marked."""
+    began = time.process_time()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        idata = psf.sample_smc(draws, model=model, random_seed=seed, progressbar=False)
+    marked = any(isinstance(one.message, psf.errors.EvidenceWarning) for one in caught)
+    z = {"evidence": idata.attrs["log_evidence"] / idata.attrs["log_evidence_se"]}
+    for name, mass in exact.items():
+        difference = idata["posterior"][name].mean().item() - mass
+        z[name] = difference / max(idata["mcse"][name].item(), 1e-300)
+    return {**z, "marked": marked, "seconds": time.process_time() - began}
+
+
+def main(n_seeds: int) -> None:
+    for build in (wells, banana, funnel):
+        model, exact = build()
+        for draws in DRAWS:
+            runs = [run(model, exact, draws, seed) for seed in range(n_seeds)]
+            names = ["evidence", *exact]
+            z = np.abs([[one[name] for name in names] for one in runs])
+            marked = np.array([one["marked"] for one in runs])
+            off = (z > 3).any(axis=1)
+            beyond = dict(zip(names, (z > 3).sum(axis=0).tolist(), strict=True))
+            seconds = np.median([one["seconds"] for one in runs])
+            print(
+                f"{build.__name__}, {draws} draws: beyond 3 errors {beyond} of {n_seeds}, "
+                f"{(off & ~marked).sum()} of them not marked; marked in all {marked.sum()}; "
+                f"{seconds:.1f} CPU s",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]))

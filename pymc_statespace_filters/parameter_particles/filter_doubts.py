@@ -1,0 +1,53 @@
+"""Whether the likelihood of a run is that of its system: the check of its filters at its end."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+
+import pymc as pm
+import xarray as xr
+from pymc.stats.convergence import log_warnings
+
+from ..filter_checks.checks import kept, store
+from ..filter_checks.finding import OFF
+from ..filters.protocol import Filter
+from ..sampling.output.filter_check import check_filters, warn_of_filters
+from .output import DoubtsOf
+from .request import Request
+
+_CHECK = 2**32 + 2  # key of random numbers beside those of the run
+
+
+def checked_at_end(model: pm.Model, request: Request, *, progressbar: bool) -> DoubtsOf:
+    """Filters are compared with unbiased ones at draws of the result, as at the end of chains."""
+
+    def doubts_of(tree: xr.DataTree, filter: Filter | None, seconds: float) -> Sequence[str]:
+        n_particles = request.draws * request.n_populations
+        with suppress(KeyboardInterrupt):
+            rng = request.generator(_CHECK)
+            found = check_filters(tree, model, n_particles, seconds, rng, filter)
+            log_warnings(found.messages("info" if progressbar else "debug"))
+            warn_of_filters(found.warned)
+            return found.warned
+        return ()
+
+    return doubts_of
+
+
+def kept_from(former: xr.DataTree) -> DoubtsOf:
+    """What was found about a filter before further rows, as far as it holds for them, too."""
+
+    def doubts_of(tree: xr.DataTree, filter: Filter | None, seconds: float) -> Sequence[str]:
+        assert filter is not None  # of a sequential run
+        if not (outcomes := kept(former, filter)):
+            return ()
+        store(tree, outcomes)
+        doubts = [f"{name}: {o['verdict']}" for name, o in outcomes.items() if o["outcome"] == OFF]
+        warn_of_filters(doubts)
+        return doubts
+
+    return doubts_of
+
+
+def not_checked(tree: xr.DataTree, filter: Filter | None, seconds: float) -> Sequence[str]:
+    """No doubts, on request."""
+    return ()
