@@ -11,7 +11,7 @@ import xarray as xr
 
 from ..compiler.numerics.philox import seeds_of_records
 from ..errors import ModelError
-from ..filters.protocol import Filter, properties
+from ..filters.protocol import Filter, check_states_filter, properties
 from ..filters.recommendation import check_system_and_filter
 from ..ops.base import evaluator
 from ..ops.states import FilterRun, ResumableRun, States
@@ -180,7 +180,7 @@ def run_filter(
     if left:
         dataset = dataset.assign(stored(left, labels))
     if properties(filter).finds_path:
-        evaluate = evaluator(States(system, filter, "most probable"))
+        evaluate = evaluator(States(system, check_states_filter(filter), "most probable"))
         paths = [evaluate(*each, own, 0)[0] for each, own in zip(arguments, rows, strict=True)]
         dataset["most_probable_path"] = (row_dim, "state"), np.concatenate(paths)
     coords: dict[str, Any]

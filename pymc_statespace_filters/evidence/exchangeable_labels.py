@@ -13,7 +13,7 @@ models", Econometrics Journal 7 (2004).
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pymc as pm
@@ -31,6 +31,7 @@ MOST_LABELS, MOST_AXES = 8, 6
 N_POINTS, N_SEEDS = 4, 8  # draws at which densities are compared; estimates of a noisy one
 ROUNDING, MAX_ERROR = 1e-7, 1.0  # relative; in nats, of a noisy difference
 N_ORDERED = 400  # draws whose order is found
+N_RELABELLED = 5  # rounds in which orders and what labels have in common are found in turn
 RARELY = 0.1  # of the share that a label would have if all orders were visited equally
 
 Array = NDArray[np.float64]
@@ -197,7 +198,8 @@ def _features(draws: Draws, axes: Sequence[Axis]) -> Array:
         numbers = [axis.number + 1 for axis in axes if axis.name == name]
         values = np.moveaxis(draws[name], numbers, range(1, 1 + len(numbers)))
         label = np.arange(values.shape[1])
-        own = values[(slice(None), *[label] * len(numbers))]
+        place: tuple[Any, ...] = (slice(None), *[label] * len(numbers))
+        own = values[place]
         columns.append(own.reshape(*own.shape[:2], -1))
     return np.concatenate(columns, axis=2)
 
@@ -208,13 +210,16 @@ def _log_visited(features: Array, best: int) -> float:
     Labels that ever take each other's place are taken to visit all orders among themselves.
     """
     count, reference = features.shape[1], features[best]
-    scale = features.std(axis=(0, 1))
-    scale[scale == 0.0] = 1.0
     chosen = features[:: -(-len(features) // N_ORDERED)]
-    distances = (((chosen[:, :, None] - reference) / scale) ** 2).sum(axis=-1)
-    share = np.zeros((count, count))
-    for one in distances:
-        share[linear_sum_assignment(one)] += 1.0 / len(distances)
+    scale = features.std(axis=(0, 1))
+    for _ in range(N_RELABELLED):
+        scale = np.where(scale > 0.0, scale, 1.0)
+        distances = (((chosen[:, :, None] - reference) / scale) ** 2).sum(axis=-1)
+        orders = np.array([linear_sum_assignment(one.T)[1] for one in distances])
+        relabelled = np.take_along_axis(chosen, orders[:, :, None], axis=1)
+        # A feature tells labels apart if it varies less within them than between them.
+        reference, scale = relabelled.mean(axis=0), relabelled.std(axis=0).mean(axis=0)
+    share = np.array([(orders == label).mean(axis=0) for label in range(count)])
     _, group = connected_components(share > RARELY / count, directed=False)
     return float(gammaln(np.bincount(group) + 1.0).sum())
 

@@ -49,7 +49,7 @@ def test_it_is_left_out_on_demand_and_after_short_runs(changes):
 
 def _with_outcome(outcome, filter):
     found = {"d": {"filter": filter, "outcome": outcome, "verdict": f"{filter} is {outcome}"}}
-    return xr.DataTree(attrs={"filter_check": json.dumps(found)})
+    return xr.DataTree(xr.Dataset(attrs={"filter_check": json.dumps(found)}))
 
 
 def test_what_holds_for_further_rows():
