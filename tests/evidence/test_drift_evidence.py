@@ -12,7 +12,7 @@ from scipy.stats import halfnorm, multivariate_normal, uniform
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence.drift.conditional import fit_conditional
-from pymc_statespace_filters.evidence.drift.marginal import ConstantModel
+from pymc_statespace_filters.evidence.drift.marginal import ConstantModel, fit_conditionals
 from pymc_statespace_filters.evidence.drift.strengths import StrengthsAtPoints
 from pymc_statespace_filters.evidence.posterior import build_posterior
 from pymc_statespace_filters.importance import log_mean_of_chains
@@ -184,6 +184,22 @@ def test_several_strengths_alone_and_together():
         row = table.loc[name]
         assert row["se"] < 0.07
         assert abs(row["log_bayes_factor"] - value) < 3.5 * row["se"]
+
+
+def test_bounded_variables_without_a_transform_are_not_translated():
+    """What they are translated to may be outside the support, and lost to the mean."""
+    with pm.Model() as model:
+        for name, transform in (("a", {}), ("b", {"default_transform": None})):
+            pm.Uniform(name, 0, 1, **transform)
+        s = pm.HalfNormal("s", 1)
+        pm.Normal("y", model["a"] + model["b"], 1 + s, observed=[0.1, 0.8])
+    rng = np.random.default_rng(1)
+    size = np.abs(rng.standard_normal((200, 1)))
+    constant = ConstantModel(model, ["s"], moved=False)
+    strengths = constant._strengths(np.column_stack([rng.random((200, 2)), np.log(size)]))
+    fit = fit_conditionals(strengths, size + rng.random((200, 2)), constant._is_bounded)
+    moved = fit.translation != 0.0
+    np.testing.assert_array_equal(moved, [[True, False], [True, False]])
 
 
 @pytest.mark.parametrize("largest", [np.inf, 1.5])

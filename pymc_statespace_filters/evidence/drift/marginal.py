@@ -16,9 +16,9 @@ the chain accepted the draw. If a noise seed reproduces it, the numerator has th
 noise of a posterior draw has the density m(v) L(s, r, v) / L(s, r); otherwise it has fresh noise.
 
 Difference from the source: the terms are taken at r' = r + b(0) - b(s) in place of r in the
-numerator, where b(s) is a regression of the draws of r on s. For each s that is a translation, of
-which the integral over r does not depend; r' is nearer to where the constant model has its
-posterior.
+numerator, where b(s) is a regression of the draws of r on s. For each s that is a translation, on
+which the integral over r does not depend if r is on the whole line; r' is nearer to where the
+constant model has its posterior. Other variables, bounded and without a transform, stay.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,6 +27,8 @@ from dataclasses import dataclass
 import numpy as np
 import pymc as pm
 from numpy.typing import NDArray
+from pymc.distributions.transforms import _default_transform
+from pytensor.tensor.variable import TensorVariable
 
 from ...compiler.native.compilation import warning_filter
 from ...pymc_model.density import ModelDensity
@@ -59,7 +61,10 @@ class ConstantModel:
         with warning_filter("ignore", "the prior of .* reaches no likelihood"):
             self.density = ModelDensity(constant, moved=moved)
         self._strengths = StrengthsAtPoints(model, names)
-        self._others = _columns(model, [rv.name for rv in constant.free_RVs])
+        others = [rv.name for rv in constant.free_RVs]
+        self._others = _columns(model, others)
+        bounded = [name for name in others if _is_bounded(model[name], model)]
+        self._is_bounded = np.isin(self._others, _columns(model, bounded))
 
     def log_terms(
         self, posterior: Posterior, seeds: NDArray[np.int64] | None, rng: np.random.Generator
@@ -73,7 +78,7 @@ class ConstantModel:
         halves = slice(None, middle), slice(middle, None)
         for fitted, averaged in (halves, halves[::-1]):
             x, at = (_flat(posterior.draws[:, part]) for part in (fitted, averaged))
-            fit = fit_conditionals(self._strengths(x), x[:, self._others])
+            fit = fit_conditionals(self._strengths(x), x[:, self._others], self._is_bounded)
             strengths, others = self._strengths(at), at[:, self._others]
             others = fit.translated(strengths.sizes, others)
             own = self._seeds(len(at), None if seeds is None else _flat(seeds[:, averaged]), rng)
@@ -116,13 +121,15 @@ class FittedConditionals:
         return np.asarray(np.sum(each, axis=0) - halved + strengths.log_jacobian)
 
 
-def fit_conditionals(strengths: Strengths, others: Array) -> FittedConditionals:
-    """Fit to draws of strengths (n, d) and other parameters (n, k)."""
+def fit_conditionals(
+    strengths: Strengths, others: Array, stays: NDArray[np.bool_]
+) -> FittedConditionals:
+    """Fit to draws of strengths (n, d) and other parameters (n, k), some of which stay (k,)."""
     sizes = strengths.sizes
     scale = np.sqrt((sizes**2).mean(axis=0))
     powers = _powers(sizes, scale)
     design = np.column_stack([np.ones(len(powers)), powers])
-    translation = np.linalg.lstsq(design, others, rcond=None)[0][1:]
+    translation = np.where(stays, 0.0, np.linalg.lstsq(design, others, rcond=None)[0][1:])
     given = _regressors(sizes, others - powers @ translation)
     fitted = map(fit_conditional, sizes.T, given, strengths.largest)
     return FittedConditionals(tuple(fitted), translation, scale)
@@ -145,10 +152,18 @@ def _flat(values: NDArray) -> NDArray:
     return values.reshape(n_chains * n_draws, n)
 
 
+def _is_bounded(rv: TensorVariable, model: pm.Model) -> bool:
+    """Whether the values of a free variable, without a transform, are not the whole line."""
+    if model.rvs_to_transforms[rv] is not None:
+        return False
+    default = _default_transform(rv.owner.op, rv)
+    return default is not None
+
+
 def _columns(model: pm.Model, names: Sequence[str]) -> NDArray[np.int64]:
     """Columns of the unconstrained vector that belong to free variables, in the order of names."""
     point = model.initial_point()
     sizes = [point[model.rvs_to_values[rv].name].size for rv in model.free_RVs]
     parts = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
     by_name = dict(zip([rv.name for rv in model.free_RVs], parts, strict=True))
-    return np.concatenate([by_name[name] for name in names])
+    return np.concatenate([by_name[name] for name in names] or [np.empty(0, dtype=np.int64)])
