@@ -212,7 +212,7 @@ def _checked(name: Any, values: Any) -> tuple[float, ...]:
         found = np.zeros(0)
     if np.ndim(values) != 1 or not found.size or not np.isfinite(found).all():
         raise ModelError(
-            f"values: those of {name!r} must be how many there are, or a sequence of finite "
-            f"numbers, got {values!r}"
+            f"values: those of {name!r} must be how many there are, at least 1, or a sequence of "
+            f"finite numbers, got {values!r}"
         )
     return tuple(found.tolist())

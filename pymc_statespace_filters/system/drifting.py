@@ -147,13 +147,15 @@ def _name(parameter: str, index: tuple[int, ...]) -> str:
 def _check_names(system: "StateSpaceModel", found: list[DriftingParameter]) -> None:
     """Raise unless every state has a name of its own, and a parameter that equations have."""
     of_law = {name for one in found for name in one.laws}
-    taken = set(system.states[: system.n - len(system.drifting)])
+    taken, drifts = set(system.states[: system.n - len(system.drifting)]), set[str]()
     for one in found:
         if one.parameter in of_law:
             raise ModelError(f"{one.name} must not drift: it is a parameter of another drift")
+        if one.name in drifts:
+            raise ModelError(f"{one.name} drifts already: give the process of each parameter once")
         if one.name in taken:
-            raise ModelError(f"{one.name} must not be the name of a state, or drift twice")
-        taken.add(one.name)
+            raise ModelError(f"{one.name} must not be the name of a state: rename the state")
+        drifts.add(one.name)
     law_names = [name for one in found[len(system.drifting) :] for name in dict.fromkeys(one.laws)]
     for name in law_names:
         if name in system.parameters:

@@ -348,7 +348,9 @@ def test_other_systems_are_refused(changes, message):
 
 def test_values_are_checked():
     """Numbers of values, sequences, names, and steps that leave them."""
-    with pytest.raises(ModelError, match="values: those of 'regime' must be how many"):
+    with pytest.raises(
+        ModelError, match="values: those of 'regime' must be how many there are, at least 1"
+    ):
         psf.FiniteStateFilter(values={"regime": 0})
     with pytest.raises(ModelError, match=r"values must name states of .*got 'phase'"):
         psf.log_likelihood(SWITCH, psf.FiniteStateFilter(values={"phase": 2}), GIVEN, **RECORD)

@@ -413,7 +413,7 @@ def negative():
         ),
         (
             lambda: psf.drifting(psf.drifting(pushed(), a=psf.RandomWalk()), a=psf.RandomWalk()),
-            "drift twice",
+            "a drifts already",
         ),
         (
             lambda: psf.drifting(pushed(states=["a"]), a=psf.RandomWalk()),
