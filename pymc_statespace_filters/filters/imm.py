@@ -45,8 +45,9 @@ class IMM(GaussianFilterBase):
     switching coefficients", IEEE Transactions on Automatic Control 33, 780-783. Differences: a step
     may depend on the regime before it as well, and is then made for every pair of regimes before
     they are merged. Probabilities of regimes may depend on the other states: they are means over
-    the Gaussian, which becomes that of the state given the regime drawn, by quadrature along the
-    line on which the probability changes at the mean. A probability that jumps is that at the mean.
+    the Gaussian, which becomes that of the state given the regime drawn, by quadrature over the
+    states on which they depend. It is accurate where they depend smoothly on one linear combination
+    of states. Of a probability that jumps, the mean may be wrong by a sixth of the jump.
 
     The error is small where an observation tells the regime soon, and not known beforehand:
     `check_filter` compares the filter with unbiased ones. `RBPF` is unbiased for systems that are

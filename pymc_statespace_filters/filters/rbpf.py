@@ -244,7 +244,7 @@ class RBPF(ParticleFilter):
     def is_exact_for(self, system: System) -> bool:
         """Whether it is linear given regimes whose probabilities do not depend on other states."""
         hybrid = hybrid_of(system.written)
-        return compile_system(hybrid.given).is_linear and hybrid.regime_forgets_state
+        return compile_system(hybrid.given).is_linear and not hybrid.deciding
 
     def linearised(self, system: System) -> System:
         """The system of the other states, which is linearised."""

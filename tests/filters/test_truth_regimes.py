@@ -5,13 +5,18 @@ import warnings
 
 import numpy as np
 import pymc as pm
+import pytensor
 import pytensor.tensor as pt
 import pytest
 import xarray as xr
+from scipy.stats import multivariate_normal
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.compiler.lowering.symbols import symbols_of
 from pymc_statespace_filters.errors import FilterWarning, ModelError
+from pymc_statespace_filters.filters.regimes.draws import draws_of
+from pymc_statespace_filters.filters.regimes.hybrid import hybrid_of
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.distributed import DistributedLogLikelihood
 from pymc_statespace_filters.ops.likelihood import LogLikelihoodOfNoise, StoredNoise
@@ -241,6 +246,76 @@ def test_probabilities_that_depend_on_the_state():
     plain = log_likelihood(psf.BootstrapPF(20_000), system, {}, seed=np.arange(10)).mean()
     assert log_likelihood(psf.IMM(), system, {}) == pytest.approx(plain, abs=0.05)
     assert log_likelihood(psf.RBPF(5000), system, {}) == pytest.approx(plain, abs=0.05)
+
+
+def logistic(a, b):
+    return 1.0 / (1.0 + np.exp(-3.0 * (a - b - 0.3)))
+
+
+# The probability of a regime, by states and on a grid of them, and the error of its mean.
+OF_STATES = {
+    "even": (lambda x: 1 - pt.exp(-(x[0] ** 2)), lambda a, b: 1 - np.exp(-(a**2)), 5e-4),
+    "jump": (lambda x: pt.switch(x[0] > 0, 0.9, 0.1), lambda a, b: 0.1 + 0.8 * (a > 0), 2e-3),
+    "line": (lambda x: pm.math.sigmoid(3 * (x[0] - x[1] - 0.3)), logistic, 2e-3),
+    "round": (
+        lambda x: 1 - pt.exp(-(x[0] ** 2) - x[1] ** 2),
+        lambda a, b: 1 - np.exp(-(a**2) - b**2),
+        0.04,
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", OF_STATES)
+def test_means_of_probabilities_are_those_of_a_grid(kind):
+    """From the mean, where slopes of most are zero; the state given the regime, too."""
+    probability, on_grid, tolerance = OF_STATES[kind]
+    system = psf.StateSpaceModel(
+        transition=lambda x, q: [x[0], x[1], q[0]],
+        process_dist=lambda x: [pm.Bernoulli.dist(probability(x))],
+        observation=lambda x: [x[0]],
+        observation_noise=[[1.0]],
+        initial_dist=lambda: [pm.Normal.dist(0, 1), pm.Normal.dist(0, 1), 0],
+    )
+    hybrid, s = hybrid_of(system), pt.tensor("s", shape=(5,), dtype="float64")
+    values = symbols_of(system)
+    drawn = [pt.constant(v) for v in hybrid.drawn]
+    weight, state = draws_of(hybrid, values, pt.zeros(1), s, drawn)[1]
+    slope = pytensor.grad(weight, s)
+    given = pytensor.function([s], [weight, state, slope], mode="FAST_COMPILE")
+    gaussian = np.array([0.0, 0.0, 1.0, 0.3, 0.8])  # mean, lower triangle of the covariance
+    weight, state, slope = given(gaussian)
+    a, b = np.meshgrid(*[np.linspace(-6, 6, 600)] * 2)
+    density = multivariate_normal([0, 0], [[1.0, 0.3], [0.3, 0.8]]).pdf(np.stack([a, b], -1))
+    joint = density * on_grid(a, b) / density.sum()
+    assert weight == pytest.approx(joint.sum(), abs=tolerance)
+    both = np.stack([a.ravel(), b.ravel()])
+    mean, cov = (
+        np.average(both, axis=1, weights=joint.ravel()),
+        np.cov(both, aweights=joint.ravel()),
+    )
+    np.testing.assert_allclose(state[:2], mean, atol=5 * tolerance if kind != "jump" else 0.03)
+    np.testing.assert_allclose(state[2:], cov[np.tril_indices(2)], atol=0.1)
+    if kind != "jump":
+        for i in range(5):
+            h = 1e-5 * np.eye(5)[i]
+            change = (given(gaussian + h)[0] - given(gaussian - h)[0]) / 2e-5
+            assert slope[i] == pytest.approx(change, abs=1e-3 if i == 3 else 1e-7)
+
+
+@pytest.mark.parametrize("filter", [psf.IMM(), psf.RBPF(10)], ids=str)
+def test_a_regime_is_entered_from_rest(filter):
+    """With probability 1 - E exp(-x^2) = 1 - 3^(-1/2)."""
+    system = switching(
+        process_dist=lambda x: [
+            pm.Bernoulli.dist(1 - pt.exp(-(x[0] ** 2))), pm.Normal.dist(0.0, 0.3)
+        ],
+        initial_dist=lambda: [pm.Normal.dist(0.0, 1.0), 0],
+        observation=lambda x: [x[1]],
+        observation_noise=[[1e-4]],
+    )  # fmt: skip
+    term = psf.log_likelihood(system, filter, {}, [1.0], steps=[1], inputs=[[0.0]])
+    exact = np.log(1 - 3**-0.5) - 0.5 * np.log(2 * np.pi * 1e-4)
+    np.testing.assert_allclose(term, exact, atol=1e-3)
 
 
 def test_held_noise_is_the_noise_of_its_seed():

@@ -1,9 +1,8 @@
 """What the finite variables of a step may be, given a Gaussian state.
 
 Their probabilities may depend on the state. They are then means over it, and the state given each
-of these values is replaced by a Gaussian with its mean and covariance, both by Gauss and Hermite's
-quadrature along one line: the one along which the probability changes at the mean. That is all of
-the state on which a function of one linear combination depends.
+of these values is replaced by a Gaussian with its mean and covariance, both by quadrature over the
+states on which the probabilities depend.
 """
 
 from collections.abc import Sequence
@@ -12,15 +11,19 @@ from typing import NamedTuple
 import numpy as np
 import pytensor
 import pytensor.tensor as pt
+from numpy.typing import NDArray
 from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
+from ...compiler.codegen.semidefinite import semidefinite_root
 from ..gaussian.linearization import pack, unpack
 from .hybrid import Hybrid, Symbols
 
-_N_NODES = 9
-_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(_N_NODES)
-_WEIGHTS /= _WEIGHTS.sum()
+N_FIRST, N_OTHERS = 12, 4
+"""Nodes along the first axis, and along each other one; even, so that none is at a jump in the
+middle."""
+
+Array = NDArray[np.float64]
 
 
 class Weighted(NamedTuple):
@@ -38,7 +41,7 @@ def draws_of(
     drawn: Sequence[TensorVariable],
 ) -> list[Weighted]:
     """The probability of each of some values, all that there are, and the state given each."""
-    if hybrid.regime_forgets_state:
+    if not hybrid.deciding:
         mean = state[: hybrid.n]
         steps = (hybrid.step(values, regime, mean, v) for v in drawn)
         return [Weighted(step.drawn.probability, state) for step in steps]
@@ -57,22 +60,69 @@ def _given(
     """The mean probability of v, and the state given v."""
     x = pt.tensor("x", shape=(hybrid.n,), dtype="float64")
     probability = hybrid.step(values, regime, x, v).drawn.probability
-    slope = pytensor.grad(probability, x, disconnected_inputs="ignore", return_disconnected="zero")
     mean, cov = unpack(state, hybrid.n)
-    slope = graph_replace(slope, {x: mean}, strict=False)
-    line = cov @ slope
-    square = pt.sum(slope * line)
-    depends = square > 0.0  # not where it jumps or is certain
-    line = pt.switch(depends, line / pt.sqrt(pt.switch(depends, square, 1.0)), 0.0)
-    at = [graph_replace(probability, {x: mean + line * node}, strict=False) for node in _NODES]
-    joint = [weight * p for weight, p in zip(_WEIGHTS, at, strict=True)]
-    total = total_of(joint)
-    divisor = pt.switch(pt.eq(total, 0.0), 1.0, total)
-    first = total_of([p * node for p, node in zip(joint, _NODES, strict=True)]) / divisor
-    second = total_of([p * node**2 for p, node in zip(joint, _NODES, strict=True)]) / divisor
-    change = pt.switch(pt.eq(total, 0.0), 0.0, second - first**2 - 1.0)
-    given = pack(mean + first * line, cov + change * line[:, None] * line[None, :])
-    return Weighted(total, given)
+    root = _root_of(cov, hybrid.deciding)
+    if len(hybrid.deciding) > 1:
+        slope = pytensor.grad(
+            probability, x, disconnected_inputs="ignore", return_disconnected="zero"
+        )
+        root = root @ _reflection(root.T @ graph_replace(slope, {x: mean}, strict=False))
+    nodes, weights = _rule(len(hybrid.deciding))
+    at = [graph_replace(probability, {x: mean + root @ node}, strict=False) for node in nodes]
+    joint = pt.stack([weight * p for weight, p in zip(weights, at, strict=True)])
+    total = pt.sum(joint)
+    is_possible = pt.neq(total, 0.0)
+    share = pt.switch(is_possible, joint / pt.switch(is_possible, total, 1.0), weights)
+    first = share @ nodes
+    second = nodes.T @ (share[:, None] * nodes)
+    change = second - first[:, None] * first[None, :] - np.eye(nodes.shape[1])
+    return Weighted(total, pack(mean + root @ first, cov + root @ change @ root.T))
+
+
+def _root_of(cov: TensorVariable, deciding: Sequence[int]) -> TensorVariable:
+    """Columns by which d white variables move the state (n, d), which are all of d of the states.
+
+    The rest of the state is independent of them.
+    """
+    n = cov.type.shape[0]
+    order = [*deciding, *(i for i in range(n) if i not in deciding)]
+    root = semidefinite_root(cov[order][:, order])
+    return root[np.argsort(order)][:, : len(deciding)]
+
+
+def _reflection(slope: TensorVariable) -> TensorVariable:
+    """An orthogonal matrix whose first column is along a vector, if that is not zero.
+
+    A function of one linear combination then changes along the first axis alone.
+    """
+    d = slope.type.shape[0]
+    square = pt.sum(slope**2)
+    depends = square > 0.0
+    first = np.eye(d)[0]
+    unit = pt.switch(depends, slope / pt.sqrt(pt.switch(depends, square, 1.0)), first)
+    normal = unit + pt.switch(unit[0] < 0.0, -first, first)
+    return np.eye(d) - 2.0 * normal[:, None] * normal[None, :] / pt.sum(normal**2)
+
+
+def _rule(d: int) -> tuple[Array, Array]:
+    """Nodes (N, d) and weights (N,) of a quadrature over d white variables.
+
+    Gauss and Hermite's along the first, times the mean of theirs along each of the others, which
+    is stretched so that the second moments are right.
+    """
+    first, weights = _gauss_hermite(N_FIRST)
+    if d == 1:
+        return first[:, None], weights
+    line, weights_on_line = _gauss_hermite(N_OTHERS)
+    others = np.kron(np.eye(d - 1), np.sqrt(d - 1) * line[:, None])
+    weights_of_others = np.tile(weights_on_line / (d - 1), d - 1)
+    nodes = np.column_stack([np.repeat(first, len(others)), np.tile(others, (N_FIRST, 1))])
+    return nodes, np.kron(weights, weights_of_others)
+
+
+def _gauss_hermite(n: int) -> tuple[Array, Array]:
+    nodes, weights = np.polynomial.hermite_e.hermegauss(n)
+    return nodes, weights / weights.sum()
 
 
 def total_of(numbers: Sequence[TensorVariable]) -> TensorVariable:

@@ -139,13 +139,17 @@ class Hybrid:
         return is_free_of(("regime",), step, {**symbols, "regime": regime})
 
     @cached_property
-    def regime_forgets_state(self) -> bool:
-        """Whether the probabilities of the next regime do not depend on the continuous states."""
-        sizes = {"regime": self.regimes.shape[1], "x": self.n, "v": self.drawn.shape[1]}
+    def deciding(self) -> list[int]:
+        """The continuous states on which the probabilities of the next regime depend."""
+        names = [f"x{i}" for i in range(self.n)]
+        sizes = {"regime": self.regimes.shape[1], "v": self.drawn.shape[1]} | dict.fromkeys(
+            names, 1
+        )
         parts = {i: pt.tensor(i, shape=(size,), dtype="float64") for i, size in sizes.items()}
         symbols = {**symbols_of(self.system), **parts}
-        found = self.step(symbols, symbols["regime"], symbols["x"], symbols["v"])
-        return is_free_of(("x",), found.drawn.probabilities, symbols)
+        x = pt.concatenate([parts[name] for name in names])
+        law = self.step(symbols, symbols["regime"], x, symbols["v"]).drawn.probabilities
+        return [i for i, name in enumerate(names) if not is_free_of((name,), law, symbols)]
 
     @cached_property
     def is_smooth(self) -> bool:
