@@ -6,7 +6,7 @@ regimes do is a list of moves, see `finite_states`, whose probabilities are here
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +33,9 @@ class Drawn(NamedTuple):
     def probability(self) -> TensorVariable:
         """That of all together; NaN if one has none, as of categories that do not sum to one."""
         is_valid = pt.all(self.is_valid > 0.0)
-        return pt.switch(is_valid, pt.prod(self.probabilities), np.nan)
+        each = [self.probabilities[i] for i in range(self.probabilities.type.shape[0] or 0)]
+        # pt.prod has no second derivative
+        return pt.switch(is_valid, reduce(pt.mul, each, pt.ones(())), np.nan)
 
 
 class Step(NamedTuple):
