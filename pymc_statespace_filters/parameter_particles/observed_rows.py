@@ -17,6 +17,7 @@ from ..pymc_model.inspection import resized
 from ..pymc_model.prior import ModelPrior
 from ..pymc_model.state_graphs import StateSpaceVariable, observed_variables
 from ..smc.particles import Particles
+from ..system.clock import Clock
 
 Array = NDArray[np.float64]
 _LARGEST_SEED = np.iinfo(np.int64).max
@@ -42,6 +43,11 @@ class ObservedRows:
     def with_record(self, record: Record) -> Self:
         """The same model of another record."""
         return type(self)(self.model, self.variable, record, self.filter)
+
+    def with_clock(self, clock: Clock) -> Self:
+        """The same model with dates that count from elsewhere."""
+        variable = self.variable._replace(clock=clock)
+        return type(self)(self.model, variable, self.record, self.filter)
 
     def of_size(self, n_members: int) -> Self:
         """The same with a filter of another number of members."""

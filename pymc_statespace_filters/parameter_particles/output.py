@@ -26,7 +26,7 @@ from ..sampling.output.deterministics import Deterministics
 from ..sampling.target.variables import RaveledVariables
 from ..smc.merging import mean_and_error, merged_index, merged_log_evidence
 from ..smc.particles import Particles
-from .request import Request, Run
+from .request import Request, Run, least_alive
 
 ESTIMATOR = "smc"
 COURSE, ERRORS = "smc", "mcse"
@@ -157,9 +157,24 @@ def _doubts(run: Run) -> Iterator[str]:
             f"the evidences of the populations have a standard deviation of {spread:.2f} of their "
             "mean, so that a few of them decide: raise draws, or narrow the priors"
         )
+    yield from _few_alive(run)
     least = float(np.nanmin(run.course["acceptance"].values, initial=1.0))
     if least < MIN_ACCEPTANCE:
         yield (
             f"moves are rarely accepted ({least:.1%} at worst): reduce the noise of the likelihood "
             "(more particles of the filter), or raise draws"
+        )
+
+
+def _few_alive(run: Run) -> Iterator[str]:
+    """What says that populations had hardly a particle left that can have given a row."""
+    if "n_alive" not in run.course:
+        return
+    least = least_alive(run.cloud)
+    few = run.course["n_alive"].transpose("population", "row").values < least
+    if few.any():
+        yield (
+            f"{few.any(axis=1).sum()} of {len(few)} populations had fewer than {least} particles "
+            f"of positive likelihood, first at observation {few.any(axis=0).argmax() + 1}: raise "
+            "draws, or narrow the priors"
         )

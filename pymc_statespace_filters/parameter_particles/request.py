@@ -71,11 +71,15 @@ def checked_request(
     return Request(int(draws), size, int(populations), entropy)
 
 
+def least_alive(cloud: Cloud) -> int:
+    """The fewest particles of a population with a positive likelihood that can be moved."""
+    return 2 * cloud.pilot.particles.x.shape[1] + 2
+
+
 def check_alive(model: pm.Model, cloud: Cloud) -> None:
     """Raise if too few particles of the pilot have a positive likelihood."""
-    particles = cloud.pilot.particles
+    particles, least = cloud.pilot.particles, least_alive(cloud)
     alive = np.isfinite(particles.log_density(1.0))
-    least = 2 * particles.x.shape[1] + 2
     if alive.sum() < least:
         dead = particles.x[~alive][:N_EXPLAINED]
         raise ModelError(

@@ -82,7 +82,8 @@ def sample_smc(
         run: of "tempered" for each ``stage`` the ``temperature``, ``effective_size`` (population,
         stage), ``acceptance``, number ``n_steps`` and relative length ``scale`` of the moves; of
         "sequential" for each ``row`` the ``score``, log p(d_j | d_1 .. d_{j-1}) with the parameters
-        integrated out, ``score_se``, ``effective_size``, the number ``n_stages`` of moves,
+        integrated out, ``score_se``, ``effective_size``, the particles ``n_alive`` of
+        positive likelihood before moves (population, row), the number ``n_stages`` of moves,
         ``acceptance``, ``n_members`` of the filter, ``variance`` of the log-likelihood where it was
         measured, and ``n_updates`` of filters. ``evidence`` holds the evidence, as
         `estimate_evidence` stores it, with the estimator "smc"; the attributes ``log_evidence`` and

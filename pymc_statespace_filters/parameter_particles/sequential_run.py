@@ -18,12 +18,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from ..errors import ModelError
 from ..importance import systematic
-from ..smc.bridge import Cloud, Crossed, Stage, cross
+from ..smc.bridge import Cloud, Crossed, Stage, cross, sizes_of_evidence
 from ..smc.merging import merged_scores
 from ..smc.particles import Populations
 from .observed_rows import ObservedRows, exchanged, exchanging
-from .request import Request, Run, check_alive
+from .request import Request, Run, check_alive, least_alive
 
 MAX_VARIANCE = 2.0  # of the log-likelihood at fixed parameters; beyond it members are doubled
 N_POINTS, N_REPEATS = 8, 8  # at and by which it is measured
@@ -37,6 +38,7 @@ class RowCourse(NamedTuple):
 
     log_evidence: Array
     effective_size: Array
+    n_alive: NDArray[np.int64]  # particles of positive likelihood, before any move
     n_stages: int
     acceptance: float
     n_members: int
@@ -77,8 +79,6 @@ def advance(progress: Progress, request: Request, show: Callable[[float, str], N
     while progress.n_rows < len(progress.rows.record.steps):
         progress = _next_row(progress, request)
         last = progress.courses[-1]
-        if progress.n_rows == 1:
-            check_alive(progress.rows.model, progress.cloud)
         sizes = f"effective size {last.effective_size.mean():.0f}"
         show(progress.n_rows, f"observation {progress.n_rows}, {sizes}")
     return progress
@@ -93,6 +93,8 @@ def _next_row(progress: Progress, request: Request) -> Progress:
         for one in (cloud.pilot, cloud.others)
     )
     cloud = cloud._replace(pilot=pilot, others=others)
+    _check_row(rows, cloud, row)
+    n_alive = cloud.others.n_alive
     found = cross(cloud, rows.at_row(row), request.size, rng)
     log_evidence, stages = before + found.log_ratio, found.stages
     n_updates = request.n_particles + (row + 1) * _n_proposals(stages, request)
@@ -107,7 +109,8 @@ def _next_row(progress: Progress, request: Request) -> Progress:
             n_updates += (row + 1) * (request.n_particles + 2 * _n_proposals(found.stages, request))
     course = RowCourse(
         log_evidence,
-        found.cloud.others.effective_sizes,
+        sizes_of_evidence(found.cloud.others, log_evidence),
+        n_alive,
         len(stages),
         float(np.mean([one.acceptance for one in stages])) if stages else np.nan,
         n_members(rows),
@@ -115,6 +118,23 @@ def _next_row(progress: Progress, request: Request) -> Progress:
         n_updates,
     )
     return Progress(rows, found.cloud, [*progress.courses, course])
+
+
+def _check_row(rows: ObservedRows, cloud: Cloud, row: int) -> None:
+    """Raise if too few particles of the pilot, or none of the others, can have given a row."""
+    if row == 0:
+        check_alive(rows.model, cloud)
+    n_alive, least = int(cloud.pilot.n_alive[0]), least_alive(cloud)
+    if n_alive >= least and cloud.others.n_alive.any():
+        return
+    shown = rows.shown_times[row]
+    values = rows.record.observed[row].tolist()
+    raise ModelError(
+        f"observed[{row}] = {values} at {shown} has likelihood zero at all but {n_alive} of "
+        f"{len(cloud.pilot.particles.x)} particles of the pilot, of which {least} are needed, and "
+        f"at all but {cloud.others.n_alive.sum()} of the populations: correct the row, widen the "
+        "noise of the system, or raise draws"
+    )
 
 
 def _n_proposals(stages: list[Stage], request: Request) -> int:
@@ -162,7 +182,10 @@ def course_dataset(courses: list[RowCourse]) -> xr.Dataset:
         if name in names
     }
     paths = np.stack([one.log_evidence for one in courses], axis=1)
-    sizes = np.stack([one.effective_size for one in courses], axis=1)
+    sizes, alive = (
+        np.stack([getattr(one, name) for one in courses], axis=1)
+        for name in ("effective_size", "n_alive")
+    )
     scores, errors = merged_scores(paths)
     of_populations = ("population", "row")
     return xr.Dataset(
@@ -171,6 +194,7 @@ def course_dataset(courses: list[RowCourse]) -> xr.Dataset:
             "score": ("row", scores),
             "score_se": ("row", errors),
             "effective_size": (of_populations, sizes),
+            "n_alive": (of_populations, alive),
             "log_evidence_so_far": (of_populations, paths),
         }
     )

@@ -12,13 +12,16 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from pytensor.compile.sharedvalue import SharedVariable
+from pytensor.graph.traversal import graph_inputs
 
 from ..errors import DataMismatchError, ModelError
 from ..pymc_model.filter_rows import Record
 from ..smc.bridge import Cloud
 from ..smc.moves import Size
 from ..smc.particles import Particles, Populations
-from ..system.graph_digest import digest, graph_digest
+from ..system.clock import Clock
+from ..system.graph_digest import described, digest, graph_digest
 from .observed_rows import ObservedRows
 from .output import COURSE
 from .request import Request
@@ -47,6 +50,7 @@ def stored(progress: Progress, request: Request) -> xr.Dataset | None:
     }
     attrs = {
         "model": identity,
+        **_stored_clock(progress.rows.variable.clock),
         "entropy": json.dumps(request.entropy),
         "draws": request.draws,
         "waste_free": int(request.size.waste_free),
@@ -76,7 +80,8 @@ def restored(idata: xr.DataTree, rows: ObservedRows) -> tuple[Progress, Request]
     attrs = state.attrs
     if _identity(rows) != attrs["model"]:
         raise DataMismatchError(
-            "model must be that of idata: its priors, parameters, system or filter are others"
+            "model must be that of idata: its priors, parameters, system, filter or values of "
+            "pm.Data are others"
         )
     draws, populations = int(attrs["draws"]), int(attrs["populations"])
     size = Size.of(draws, bool(attrs["waste_free"]))
@@ -85,7 +90,7 @@ def restored(idata: xr.DataTree, rows: ObservedRows) -> tuple[Progress, Request]
         rows = rows.of_size(int(attrs["n_members"]))
     pilot, others = (_populations(state, prefix) for prefix in _POPULATIONS)
     cloud = Cloud(pilot, others, float(attrs["scale"]))
-    rows = rows.with_record(_record(state, rows))
+    rows = rows.with_clock(_clock(attrs)).with_record(_record(state, rows))
     return Progress(rows, cloud, _courses(idata[COURSE].to_dataset())), request
 
 
@@ -107,6 +112,16 @@ def _record(state: xr.Dataset, rows: ObservedRows) -> Record:
     return Record(steps, observed, inputs, np.asarray(state["record_t0"].values))
 
 
+def _stored_clock(clock: Clock) -> dict[str, Any]:
+    """The dates of a run count from its own origin, whatever the record of a later model."""
+    return {"unit": clock.unit or 0, "origins": list(clock.origins), "zoned": int(clock.zoned)}
+
+
+def _clock(attrs: dict[str, Any]) -> Clock:
+    origins = tuple(map(int, np.atleast_1d(attrs["origins"])))
+    return Clock(int(attrs["unit"]) or None, origins, bool(attrs["zoned"]))
+
+
 def _courses(course: xr.Dataset) -> list[RowCourse]:
     columns = [course[_PATHS.get(name, name)].transpose("row", ...) for name in RowCourse._fields]
     rows = zip(*(column.values for column in columns), strict=True)
@@ -119,6 +134,10 @@ def _identity(rows: ObservedRows) -> str:
     free = [model.rvs_to_values[rv] for rv in model.free_RVs]
     graphs = [model.logp(vars=model.free_RVs), *model.replace_rvs_by_values([variable.theta])]
     known = {value: digest("value of", str(value.name)) for value in free}
+    for own in graph_inputs(graphs):
+        if isinstance(own, SharedVariable):
+            value = own.get_value(borrow=True)
+            known[own] = digest(described(f"the value of {own.name}", value))
     facts = [variable.name, variable.system.fingerprint, repr(variable.filter)]
     facts += [str(variable.score_from), repr(variable.clock.unit)]
     return digest(*facts, graph_digest(graphs, known))

@@ -24,12 +24,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import ModelError
 from .kernel import fitted_kernel
 from .moves import Moved, Size, move_others, move_pilot
 from .particles import Evaluate, Populations
 from .temperature import next_temperature
 
-ESS_FRACTION = 0.5  # of the pilot's particles, at which all are moved
+ESS_FRACTION = 0.5  # of all the pilot's particles, those of zero likelihood included
+
+_NONE_ALIVE = "the likelihood is zero at all particles"
 
 Array = NDArray[np.float64]
 
@@ -76,22 +79,36 @@ def cross(
     temperature, log_ratio = 0.0, np.zeros(len(cloud.others.log_weights))
     stages: list[Stage] = []
     while True:
-        pilot = cloud.pilot
-        raised = next_temperature(
-            temperature, pilot.particles.increment, ESS_FRACTION, pilot.log_weights[0]
-        )
-        pilot, _ = pilot.raised(raised - temperature)
+        raised = _raised(cloud.pilot, temperature)
+        pilot, _ = cloud.pilot.raised(raised - temperature)
         others, log_mean = cloud.others.raised(raised - temperature)
         log_ratio += log_mean
+        if np.isneginf(log_ratio).all():
+            raise ModelError(f"{_NONE_ALIVE} of the populations: raise draws, or narrow the priors")
         temperature, cloud = raised, cloud._replace(pilot=pilot, others=others)
         if temperature == 1.0 and not refresh:
             return Crossed(cloud, log_ratio, stages)
-        sizes = others.effective_sizes
+        sizes = sizes_of_evidence(others, log_ratio)
         cloud, moved = _moved(cloud, temperature, evaluate, size, rng)
         stages.append(Stage(temperature, sizes, moved.n_steps, moved.acceptance, cloud.scale))
         on_stage(stages[-1])
         if temperature == 1.0:
             return Crossed(cloud, log_ratio, stages)
+
+
+def sizes_of_evidence(others: Populations, log_evidences: Array) -> Array:
+    """Effective sizes of populations; 0 of one that has no evidence, and counts no more."""
+    return np.where(np.isneginf(log_evidences), 0.0, others.effective_sizes)
+
+
+def _raised(pilot: Populations, temperature: float) -> float:
+    """The next temperature; the present one if so many particles have zero likelihood."""
+    increment = pilot.particles.increment
+    n_alive = np.isfinite(increment).sum()
+    if n_alive == 0:
+        raise ModelError(f"{_NONE_ALIVE} of the pilot: raise draws, or narrow the priors")
+    fraction = ESS_FRACTION * len(increment) / n_alive
+    return next_temperature(temperature, increment, fraction, pilot.log_weights[0])
 
 
 def _moved(

@@ -76,6 +76,12 @@ class Populations(NamedTuple):
         """Kish's effective sample size of each population, (R,)."""
         return np.exp(-logsumexp(2 * self.log_weights, axis=1))
 
+    @property
+    def n_alive(self) -> NDArray[np.int64]:
+        """Particles of positive likelihood in each population, (R,)."""
+        alive = np.isfinite(self.particles.log_likelihood).reshape(self.log_weights.shape)
+        return np.asarray(alive.sum(axis=1))
+
     @classmethod
     def of_equal_weights(cls, particles: Particles, n_populations: int) -> Self:
         """Populations of equal sizes, one behind the other."""

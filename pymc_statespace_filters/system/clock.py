@@ -18,11 +18,12 @@ class Clock:
 
     Without a ``unit`` they are the user's numbers. With one, it is the duration of one unit of
     model time in nanoseconds, and ``origins`` are the dates at model time 0 of each record, or one
-    for all, in nanoseconds since 1970.
+    for all, in nanoseconds since 1970; ``zoned``, whether the user's dates have a time zone.
     """
 
     unit: int | None = None
     origins: tuple[int, ...] = ()
+    zoned: bool = False
 
     def shown(self, times: Any, record: int = 0) -> Any:
         """The user's times: numbers, or dates (datetime64, UTC), rounded to 1e-9 of a unit."""
@@ -73,13 +74,13 @@ def clock_and_start(
             f"unit must be the duration of one unit of model time where {name} are dates, such as "
             'unit="D" where dt and rates count days, got None'
         )
-    length = unit_of(unit)
+    length, zoned = unit_of(unit), has_zone(name, times[0])
     if are_dates(t0):
-        return Clock(length, (int(_nanoseconds("t0", [t0])[0]),)), 0.0
+        return Clock(length, (int(_nanoseconds("t0", [t0])[0]),), zoned), 0.0
     start = check_finite("t0", t0)
     moved = round(start * length)
     firsts = [int(_nanoseconds(name, own)[0]) - moved for own in times]
-    return Clock(length, tuple(firsts)), start
+    return Clock(length, tuple(firsts), zoned), start
 
 
 def unit_of(unit: Any) -> int:
@@ -121,12 +122,17 @@ def times_of_data(observed: Any) -> Any:
     return None
 
 
+def has_zone(name: str, dates: Any) -> bool:
+    """Whether dates have a time zone."""
+    return _index(name, dates).tz is not None
+
+
 def check_zones(dates: Mapping[str, Any]) -> None:
     """Raise unless all dates, by the names of their arguments, have a time zone or none has."""
-    zones = {name: _index(name, own).tz is not None for name, own in dates.items()}
+    zones = {name: has_zone(name, own) for name, own in dates.items()}
     if len(set(zones.values())) > 1:
-        aware = [name for name, has_zone in zones.items() if has_zone]
-        naive = [name for name, has_zone in zones.items() if not has_zone]
+        aware = [name for name, zoned in zones.items() if zoned]
+        naive = [name for name, zoned in zones.items() if not zoned]
         raise ModelError(
             f"{' and '.join(naive)} must have a time zone, as {' and '.join(aware)}, or none of "
             f"them: write .tz_localize(zone), got {shortened(dates[naive[0]])}"

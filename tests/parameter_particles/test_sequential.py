@@ -1,6 +1,7 @@
 """Sequential runs against the exact evidence after each row, and their extension."""
 
 import numpy as np
+import pandas as pd
 import pymc as pm
 import pytest
 import xarray as xr
@@ -153,6 +154,50 @@ def test_an_extension_that_disagrees_is_refused(by_filter):
     tempered = psf.sample_smc(50, model=built, populations=2, random_seed=1, progressbar=False)
     with pytest.raises(ModelError, match="idata must have the group 'smc_state'"):
         psf.extend(tempered, built, **new)
+
+
+WEEKS = pd.date_range("2024-01-07", periods=6, freq="W", tz="Asia/Tokyo")
+
+
+def _weekly(begin, end):
+    series = pd.Series(DATA[8:14, 0], index=WEEKS)[begin:end]
+    return series, model(psf.EKF(), steps=None, observed=series, unit="W")
+
+
+@pytest.mark.filterwarnings("ignore:the log-evidence")  # few particles
+def test_dates_count_from_the_origin_of_the_run():
+    settings = SETTINGS | {"draws": 20, "populations": 2}
+    first = psf.sample_smc(model=_weekly(0, 4)[1], **settings)
+    whole = psf.sample_smc(model=_weekly(0, 6)[1], **settings)
+    later, window = _weekly(3, 6)
+    longer = psf.extend(first, window, observed=later, progressbar=False)
+    assert longer["posterior"].to_dataset().equals(whole["posterior"].to_dataset())
+    assert longer["smc"].to_dataset().equals(whole["smc"].to_dataset())
+    assert longer["smc_state"]["record_steps"].values.tolist() == list(range(6))
+    with pytest.raises(ModelError, match="times must have a time zone, as those of the run"):
+        psf.extend(first, window, observed=later.tz_localize(None), progressbar=False)
+
+
+@pytest.mark.filterwarnings("ignore:the log-evidence")  # few particles
+def test_values_of_data_are_part_of_the_model():
+    with pm.Model() as built:
+        scale = pm.Data("scale", 2.0)
+        pm.Normal("a", 0, scale)
+        psf.StateSpace("d", FREE, psf.EKF(), steps=STEPS[:3], observed=DATA[:3])
+    first = psf.sample_smc(model=built, **SETTINGS | {"draws": 20, "populations": 2})
+    new = {"observed": DATA[3:4], "steps": STEPS[3:4], "progressbar": False}
+    psf.extend(first, built, **new)
+    scale.set_value(3.0)
+    with pytest.raises(DataMismatchError, match=r"values of pm\.Data are others"):
+        psf.extend(first, built, **new)
+
+
+def test_a_row_that_is_impossible_is_named(by_filter):
+    new = {"observed": [1e200], "steps": [25], "progressbar": False}
+    with pytest.raises(
+        ModelError, match=r"observed\[24\] = \[1e\+200\] at 25.0 .* all but 0 of 150"
+    ):
+        psf.extend(by_filter[psf.EKF()], model(psf.EKF()), **new)
 
 
 def test_data_that_do_not_come_row_by_row_are_refused():

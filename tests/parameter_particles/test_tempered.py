@@ -1,5 +1,7 @@
 """Tempered runs of PyMC models against exact evidences and posteriors."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pymc as pm
 import pytest
@@ -12,6 +14,8 @@ from pymc_statespace_filters.parameter_particles.output import _doubts
 from pymc_statespace_filters.parameter_particles.request import Run
 from pymc_statespace_filters.pymc_model.density import ModelDensity
 from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
+from pymc_statespace_filters.smc.bridge import Cloud
+from pymc_statespace_filters.smc.particles import Populations
 from tests.parameter_particles.autoregression import exact, model
 
 Y = np.random.default_rng(1).normal(1.0, 1.0, 12)
@@ -116,3 +120,12 @@ def test_populations_that_differ_and_moves_that_fail_are_doubts():
     assert "a few of them decide" in doubts
     assert "rarely accepted (1.0% at worst)" in doubts
     assert not list(_doubts(Run(None, np.array([0.0, -0.1, 0.2]), course[{"stage": [0]}])))
+
+
+def test_populations_with_hardly_a_particle_of_positive_likelihood_are_a_doubt():
+    alive = xr.DataArray([[9, 9], [9, 1], [9, 0]], dims=("population", "row"))
+    course = xr.Dataset({"acceptance": ("row", [0.3, 0.3]), "n_alive": alive})
+    one = Populations(SimpleNamespace(x=np.zeros((9, 1))), None)
+    (doubt,) = _doubts(Run(Cloud(one, one), np.zeros(3), course))
+    assert "2 of 3 populations had fewer than 4 particles" in doubt
+    assert "first at observation 2" in doubt
