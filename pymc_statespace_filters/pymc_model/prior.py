@@ -24,6 +24,7 @@ from .density import ModelDensity, RowFunction
 
 _IMPROPER = (FlatRV, HalfFlatRV, ICARRV)  # PyMC's densities without a finite integral
 _N_TRIED = 50  # draws to test whether a transform is invertible on the whole support
+_MAX_REPEATED = 0.01  # share of draws; rounding repeats far fewer
 
 Array = NDArray[np.float64]
 
@@ -130,8 +131,9 @@ class ModelPrior:
         ------
         ModelError
             If a prior cannot be sampled, like ``pm.Flat``; if a transform excludes a part of the
-            support, as an ordering does, so that the density is not that of the draws; or if draws
-            are rounded to the edge of the support, where the transform is infinite.
+            support, as an ordering does, so that the density is not that of the draws; if single
+            values have a positive probability, as of ``pm.Censored``; or if draws are rounded
+            to the edge of the support, where the transform is infinite.
         """
         model = self._model
         if improper := [rv.name for rv in model.free_RVs if not can_sample(rv, model)]:
@@ -157,7 +159,22 @@ class ModelPrior:
                 "support, where the transform is infinite: give the model a prior with less mass "
                 "there"
             )
+        self._check_no_atoms(found)
         return found
+
+    def _check_no_atoms(self, draws: Array) -> None:
+        """Raise if a variable takes single values with positive probability, as a clipped one."""
+        model, start = self._model, self._model.initial_point()
+        sizes = [start[model.rvs_to_values[rv].name].size for rv in model.free_RVs]
+        names = np.repeat([rv.name for rv in model.free_RVs], sizes)
+        for name, column in zip(names, draws.T, strict=True):
+            repeated = len(column) - len(np.unique(column))
+            if repeated > _MAX_REPEATED * len(column):
+                raise ModelError(
+                    f"{repeated} of {len(column)} draws of the prior of {name} repeat a value: it "
+                    "has single values of positive probability, as pm.Censored has, and no "
+                    "density there; give it a prior with a density, such as pm.Truncated"
+                )
 
     @cached_property
     def _density(self) -> RowFunction:

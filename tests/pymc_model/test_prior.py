@@ -103,6 +103,10 @@ def test_the_generator_decides_the_draws(model):
             lambda: pm.Beta("free", 1e-3, 1e-3),
             r"\d+ of 20 draws of the prior are rounded to the edge of their support",
         ),
+        (
+            lambda: pm.Censored("free", pm.Normal.dist(), lower=-1, upper=1),
+            r"\d+ of 20 draws of the prior of free repeat a value",
+        ),
     ],
 )
 def test_priors_that_cannot_be_drawn_from(prior, message):
