@@ -266,7 +266,7 @@ VECTOR = make(transition=lambda x, q, k: k * x + q[0], shapes={"k": (2,)})
 
 RECORDS = {
     # steps and times
-    "neither": (dict(steps=None), "exactly one of steps and times"),
+    "neither": (dict(steps=None), "observed brings no dates: give steps or times"),
     "both": (dict(times=[0.0, 1.0]), "exactly one of steps and times"),
     "empty": (dict(steps=[], observed=[]), "steps must hold at least one step"),
     "not increasing": (dict(steps=[1, 1]), r"steps\[0\] = 1 .*followed by 1"),

@@ -26,11 +26,12 @@ from .signatures import GRADIENT, LIKELIHOOD_OF_NOISE, PREDICTIONS, PULLBACK, RU
 class FiniteStateFilter:
     """Forward algorithm: the exact likelihood of a system whose states take finitely many values.
 
-    Hidden Markov models, Markov-switching regressions, counts of a small population: every state of
-    the system is a number at the start or drawn from ``pm.Bernoulli``, ``pm.Categorical``,
-    ``pm.DiscreteUniform`` or ``pm.Binomial``, and every step leads to such values, which the filter
-    finds. Probabilities of moves may depend on the state, on inputs, time and parameters, and
-    observations may have any density. The filter is deterministic and has a gradient.
+    For hidden Markov models, Markov-switching regressions and counts in a small population. Every
+    state of the system must be a number at the start or be drawn from ``pm.Bernoulli``,
+    ``pm.Categorical``, ``pm.DiscreteUniform`` or ``pm.Binomial``, and change through such variables
+    alone; the filter finds the values. Transition probabilities may depend on the state, on inputs,
+    time and parameters, and observations may have any density. The filter is deterministic and has
+    a gradient.
 
     Parameters
     ----------
@@ -46,12 +47,13 @@ class FiniteStateFilter:
 
     Notes
     -----
-    Time grows with the number of moves, one for each joint value of the states and each value that
-    the noise may take there. Probabilities that depend on parameters alone are computed once for an
-    evaluation. A state whose probability is below 1e-308 of the likeliest one's is dropped.
+    Time grows with the number of transitions, one for each joint value of the states and each value
+    that the noise may take there. Probabilities that depend on parameters alone are computed once
+    for an evaluation. A state whose probability is below 1e-308 of the likeliest one's is dropped.
 
     L. R. Rabiner, "A tutorial on hidden Markov models", Proceedings of the IEEE 77 (1989). The
-    gradient is the reverse of the scaled recursion, so that moves of probability zero do no harm.
+    gradient is the reverse of the scaled recursion, so that transitions of probability zero do no
+    harm.
 
     Examples
     --------

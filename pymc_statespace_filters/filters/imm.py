@@ -24,10 +24,11 @@ class IMM(GaussianFilterBase):
 
     A regime is a state of finitely many values, drawn in ``process_dist`` by `pm.Bernoulli`,
     `pm.Categorical`, `pm.DiscreteUniform` or `pm.Binomial`, or several such states; the other
-    states are moved by normal noise. The filter has the probability of every regime, and a Gaussian
-    of the other states given it, which ``inner`` moves and updates. Whatever leads to the same
-    regime is merged to one Gaussian of the same mean and covariance after every step. That is the
-    approximation. The filter is deterministic and has a gradient, so NUTS works with it.
+    states are driven by normal noise. The filter tracks the probability of every regime, and a
+    Gaussian of the other states given it, which ``inner`` predicts and updates. After every step
+    the Gaussians of all paths that end in the same regime are merged into one Gaussian of the same
+    mean and covariance. That is the approximation. The filter is deterministic and has a gradient,
+    so NUTS works with it.
 
     Parameters
     ----------
@@ -49,9 +50,9 @@ class IMM(GaussianFilterBase):
     states on which they depend. It is accurate where they depend smoothly on one linear combination
     of states. Of a probability that jumps, the mean may be wrong by a sixth of the jump.
 
-    The error is small where an observation tells the regime soon, and not known beforehand:
-    `check_filter` compares the filter with unbiased ones. `RBPF` is unbiased for systems that are
-    linear given the regime. There are at most 64 ways from regime to regime.
+    The error is small where the observations identify the regime soon. Its size is not known
+    beforehand: `check_filter` compares the filter with unbiased ones. `RBPF` is unbiased for
+    systems that are linear given the regime. At most 64 transitions between regimes are allowed.
 
     Examples
     --------

@@ -169,7 +169,7 @@ class RBPF(ParticleFilter):
 
     A regime is a state of finitely many values, drawn in ``process_dist`` by `pm.Bernoulli`,
     `pm.Categorical`, `pm.DiscreteUniform` or `pm.Binomial`, or several such states; the other
-    states are moved by normal noise. A particle is a path of regimes, with the mean and covariance
+    states are driven by normal noise. A particle is a path of regimes, with the mean and covariance
     that ``inner`` finds for the other states given this path. Where the system is linear given the
     regimes, and their probabilities do not depend on the other states, the estimate of the
     likelihood has the exact likelihood as its mean, for any number of particles, and far less noise
@@ -200,8 +200,8 @@ class RBPF(ParticleFilter):
     Bayesian networks", Proceedings of the 16th Conference on Uncertainty in Artificial
     Intelligence, 176-183. On the last step in front of an observation every regime is tried, and
     one is drawn given the observation, as in Chen and Liu (2000), "Mixture Kalman filters", Journal
-    of the Royal Statistical Society B 62, 493-508; those of the steps before are drawn from their
-    own law. Particles of a `run_filter` are regimes and means.
+    of the Royal Statistical Society B 62, 493-508; those of earlier steps are drawn from
+    their own distribution. Particles of a `run_filter` are regimes and means.
 
     Examples
     --------

@@ -3,7 +3,7 @@
 Messages recommend filters through this module alone. The filters' own checks decide.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from typing import Any
 
@@ -30,6 +30,8 @@ FILTERS: tuple[Filter, ...] = (
     BootstrapPF(1000), PFEnKF(1000), EnKF(1000),
 )  # fmt: skip
 
+_OF_REGIMES = (IMM, RBPF)
+
 # Particles that take as long as what does not depend on their number: a guide, or the calls of a
 # filter without one. Measured on a double well and a Duffing oscillator, 200 observations.
 _GUIDE, _REST = 500, 100
@@ -55,20 +57,30 @@ def listed(filters: Iterable[Filter]) -> str:
     return ", ".join(map(short_form, filters))
 
 
+def _either(filters: Sequence[Filter]) -> str:
+    """The short forms of filters, the last after "or"."""
+    *others, last = map(short_form, filters)
+    return f"{', '.join(others)} or {last}" if others else last
+
+
 def filters_for(system: System, *, without: Any = None) -> list[Filter]:
     """The filters of the package that take a system, but not the kind of filter ``without``.
 
-    Of a deterministic system the others would repeat what the EKF computes.
+    Of a deterministic system the others would repeat what the EKF computes. Where a system switches
+    between regimes, filters with a single Gaussian are far off.
     """
-    found = []
-    for filter in (EKF(),) if system.is_deterministic else FILTERS:
-        try:
-            filter.check(system)
-        except ModelError:
-            continue
-        if type(filter) is not type(without):
-            found.append(filter)
-    return found
+    found = [f for f in ((EKF(),) if system.is_deterministic else FILTERS) if _takes(f, system)]
+    if any(isinstance(f, _OF_REGIMES) for f in found):
+        found = [f for f in found if not isinstance(f, EKF | UKF | IPLF)]
+    return [f for f in found if type(f) is not type(without)]
+
+
+def _takes(filter: Filter, system: System) -> bool:
+    try:
+        filter.check(system)
+    except ModelError:
+        return False
+    return True
 
 
 def exact_filter(system: System, *, without: Any = None) -> Filter | None:
@@ -118,13 +130,20 @@ def jump_problem(system: System, filter: Any) -> str | None:
         jumping = tuple(name for name in jumping if name != "transition")
     if not jumping:
         return None
-    better = [f for f in _followers(system, filter) if f.is_exact_for(system)]
-    remedy = f"; {listed(better)} does not linearise" if better else ""
+    followers = _followers(system, filter)
+    of_regimes = [f for f in followers if isinstance(f, _OF_REGIMES)]
+    exact = [f for f in followers if f not in of_regimes and f.is_exact_for(system)]
     verb = "jump" if len(jumping) > 1 else "jumps"
+    reason = (
+        f"the {' and the '.join(jumping)} of this system {verb} where the state crosses a threshold"
+    )
+    if of_regimes and not isinstance(filter, _OF_REGIMES):
+        reason = "this system switches between regimes"
+    better = of_regimes + exact
+    remedy = f"; use {_either(better)}" if better else ""
     return (
-        f"{short_form(filter)}: the {' and the '.join(jumping)} of this system {verb} where the "
-        f"state crosses a threshold, which no linearisation follows, and the log-likelihood may be "
-        f"far off{remedy}."
+        f"{short_form(filter)}: {reason}, which no linearisation follows, and the log-likelihood "
+        f"may be far off{remedy}."
     )
 
 

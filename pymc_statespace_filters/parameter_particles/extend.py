@@ -130,7 +130,9 @@ def _new_rows(
 ) -> CheckedRecord:
     """The rows that come after those seen, as a record of their own; the others must agree."""
     system, clock = rows.variable.system, rows.variable.clock
-    if (steps is None) == (times is None):
+    if steps is None and times is None:
+        raise ModelError("observed brings no dates: give steps or times")
+    if steps is not None and times is not None:
         raise ModelError("give exactly one of steps and times")
     seen = rows.record.steps if steps is not None else rows.seen_times
     name, given = ("steps", check_steps(steps)) if steps is not None else ("times", times)

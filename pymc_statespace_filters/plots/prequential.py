@@ -19,7 +19,7 @@ PANELS = "score_difference", "log_bayes_factor", "probability"
 def plot_prequential(
     results: Mapping[str, xr.DataTree], *, backend: str | None = None, **pc_kwargs: Any
 ) -> PlotCollection:
-    """Plot which observations speak for which model, and the verdict as the data come in.
+    """Plot which observations favour which model, and the log Bayes factor after each of them.
 
     The first panel has for each row the difference of the scores log p(d_j | d_1 .. d_{j-1}) of
     each model to that of the first one; the parameters are integrated out. The second has their

@@ -98,6 +98,13 @@ def unit_of(unit: Any) -> int:
     return int(length)
 
 
+def unit_text(unit: int) -> str:
+    """The unit of some nanoseconds as a user writes it, see `unit_of`."""
+    names = (name for name in ("D", "h", "min", "s", "ms", "us") if unit_of(name) == unit)
+    found = next(names, None)
+    return f'"{found}"' if found else f"pd.Timedelta('{pd.Timedelta(unit, unit='ns')}')"
+
+
 def are_dates(times: Any) -> bool:
     """Whether times are dates and not numbers."""
     if isinstance(times, datetime.date | np.datetime64):

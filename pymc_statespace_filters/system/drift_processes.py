@@ -14,7 +14,7 @@ from .links import Link, read_scale
 
 @dataclass(frozen=True)
 class DriftProcess:
-    """What all laws of drift have: a scale, and how many steps a value is held."""
+    """What all processes of drift have: a scale, and how many steps a value is held."""
 
     _: KW_ONLY
     scale: Any = "identity"

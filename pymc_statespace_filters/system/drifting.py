@@ -22,7 +22,7 @@ def drifting(system: "StateSpaceModel", /, **processes: DriftProcess) -> "StateS
     A drifting parameter is a state on the scale of its process, :math:`z = \ell(\beta)`, which
     moves once at the end of each step, outside substeps. Its name is that of the parameter, and its
     value at the start is the parameter: priors keep their meaning. States, plots and forecasts
-    report it in the units of the parameter. The law of the drift has parameters of its own:
+    report it in the units of the parameter. The drift has its own parameters:
 
     * ``beta_strength``, of both processes: the standard deviation of z per square root of time;
     * ``beta_rate``, of `OrnsteinUhlenbeck`: the rate at which z returns to its start.
@@ -36,7 +36,7 @@ def drifting(system: "StateSpaceModel", /, **processes: DriftProcess) -> "StateS
     system : StateSpaceModel
     **processes : RandomWalk or OrnsteinUhlenbeck
         One for each drifting parameter, by its name. All elements of an array of parameters drift,
-        each by a strength of its own: ``b_strength`` has the shape of ``b``. One element is given
+        each with its own strength: ``b_strength`` has the shape of ``b``. One element is given
         as ``**{"b[2]": psf.RandomWalk()}``, with the parameter ``b[2]_strength``.
 
     Returns
@@ -57,8 +57,8 @@ def drifting(system: "StateSpaceModel", /, **processes: DriftProcess) -> "StateS
     zero their approximation of a nonlinear system may differ from that without drift.
 
     A particle is a path of the parameters too; a Gaussian filter has a mean and a covariance
-    of them on their scales. Moments that are reported in a parameter's units are those of a normal
-    law on its scale, which is exact for Gaussian filters; draws are exact for all.
+    of them on their scales. Moments that are reported in a parameter's units assume a normal
+    distribution on its scale, which is exact for Gaussian filters; draws are exact for all.
 
     Examples
     --------
@@ -97,6 +97,8 @@ def _drifting_parameters(
     system: "StateSpaceModel", key: str, process: Any
 ) -> list[DriftingParameter]:
     """The states of one drifting parameter, by its name or that of an element."""
+    if isinstance(process, type) and issubclass(process, DriftProcess):
+        raise ModelError(f"{key} must be a process, got a class: write psf.{process.__name__}()")
     if not isinstance(process, DriftProcess):
         raise ModelError(
             f"{key} must be psf.RandomWalk(...) or psf.OrnsteinUhlenbeck(...), got {process!r}"

@@ -71,9 +71,11 @@ class GivenRecord:
         found = times_of_data(self.observed)
         if found is None and isinstance(self.observed, pd.Series | pd.DataFrame):
             raise ModelError(
-                "give exactly one of steps and times, or dates as the index of observed (read text "
-                f"with pd.to_datetime): it holds no dates, got {shortened(self.observed.index)}"
+                "observed brings no dates: give steps or times, or dates as its index (read text "
+                f"with pd.to_datetime), got the index {shortened(self.observed.index)}"
             )
+        if found is None and self.observed is not None:
+            raise ModelError("observed brings no dates: give steps or times")
         return found
 
 

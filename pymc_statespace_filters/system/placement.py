@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import ModelError
-from .clock import Clock, are_dates, check_zones, clock_and_start
+from .clock import Clock, are_dates, check_zones, clock_and_start, unit_text
 from .model import StateSpaceModel
 from .steps import GRID_TOLERANCE, check_steps
 from .time_axis import (
@@ -193,11 +193,30 @@ def check_takes(system: StateSpaceModel, given: TimesBetween, clock: Clock, reco
     for name, times in (("times", given.times), ("input_times", given.breaks)):
         off = off_grid(times, given.t0, system.dt)
         if (off > GRID_TOLERANCE).any():
-            at = int(np.argmax(off))
-            value = clock.shown(times, record)[at]
-            what = f"times[{at}] =" if name == "times" else "the change of the inputs at"
+            rows = np.flatnonzero(off > GRID_TOLERANCE)
+            at = int(rows[0])
+            value = _text(clock.shown(times, record)[at])
+            what = f"times[{at}] = {value} is"
+            if name == "input_times":
+                what = f"the change of the inputs at {value} is"
+            elif 1 < rows.size == times.size:
+                what = f"all {rows.size} rows of times, the first at {value}, are"
             raise ModelError(
-                f"{what} {_text(value)} is off the grid t0 + k*dt with t0 = {given.t0:g} and dt = "
-                f"{system.dt:g} by {off[at]:.3g} steps, and {system.why_one_length}; round with "
-                "psf.nearest_steps(times, dt, t0=t0)"
+                f"{what} off the grid t0 + k*dt with {_grid(given.t0, system.dt, clock, record)}"
+                f" by {off[at]:.3g} steps, and {system.why_one_length}; round with "
+                f"{_rounding(clock)}"
             )
+
+
+def _grid(t0: float, dt: float, clock: Clock, record: int) -> str:
+    """The grid as a user gives it."""
+    if clock.unit is None:
+        return f"t0 = {t0:g} and dt = {dt:g}"
+    return f"t0 = {clock.shown([t0], record)[0]}, dt = {dt:g} and unit={unit_text(clock.unit)}"
+
+
+def _rounding(clock: Clock) -> str:
+    """The call that rounds times to steps."""
+    if clock.unit is None:
+        return "steps=psf.nearest_steps(times, dt, t0=t0)"
+    return f"steps=psf.nearest_steps(dates, dt, t0=t0, unit={unit_text(clock.unit)})"

@@ -12,10 +12,10 @@ from .equations import as_symbol, static_shape
 
 
 def stationary(probabilities: Any) -> TensorVariable:
-    """Return the distribution that the moves of a Markov chain do not change.
+    """Return the stationary distribution of a Markov chain.
 
-    For a start in ``initial_dist``, ``pm.Categorical.dist(psf.stationary(P))``: a chain that has
-    run for long before the record begins.
+    For a start in ``initial_dist``, ``pm.Categorical.dist(psf.stationary(P))``: the chain has
+    run for a long time before the record begins.
 
     Parameters
     ----------

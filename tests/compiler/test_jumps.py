@@ -100,8 +100,7 @@ def test_a_filter_that_linearises_a_jump_is_warned_of_once():
         psf.log_likelihood(switched, psf.EKF(), {"a": [0.1, 0.2, 0.3]}, **RECORD)
     assert [str(w.message) for w in caught] == [
         "EKF(): the transition of this system jumps where the state crosses a threshold, which no "
-        "linearisation follows, and the log-likelihood may be far off; BootstrapPF(1000) does not "
-        "linearise."
+        "linearisation follows, and the log-likelihood may be far off; use BootstrapPF(1000)."
     ]
     assert caught[0].filename == __file__
     with pytest.warns(psf.errors.FilterWarning, match="jumps") as caught:

@@ -13,6 +13,7 @@ from pymc_statespace_filters.filters.recommendation import (
     alternatives,
     collapse_remedy,
     filters_for,
+    jump_problem,
     quiet_filter,
     short_form,
 )
@@ -113,6 +114,24 @@ def test_the_remedy_of_a_collapse_works_for_the_system(name, filter, words):
     for known in PARTICLES | GAUSSIAN | {"EnKF", "GridFilter"}:
         recommended = re.search(rf"\b{known}\(", remedy)
         assert not recommended or known in expected - {type(filter).__name__}
+
+
+def test_filters_of_regimes_are_recommended_where_a_system_switches():
+    def noise(x):
+        regime = pm.Bernoulli.dist(pt.switch(x[1] > 0.5, 0.9, 0.1))
+        return [regime, pm.Normal.dist(0.0, 1.0)]
+
+    switching = system(
+        transition=lambda x, q: [pt.switch(q[0] > 0.5, 0.9, 0.2) * x[0] + q[1], q[0]],
+        process_noise=..., process_dist=noise, **TWO | dict(initial_cov=np.diag([1.0, 0.0])),
+    )  # fmt: skip
+    compiled = compile_system(switching)
+    assert kinds(filters_for(compiled)) == {"IMM", "RBPF", "BootstrapPF", "EnKF"}
+    assert jump_problem(compiled, psf.EKF()) == (
+        "EKF(): this system switches between regimes, which no linearisation follows, and the "
+        "log-likelihood may be far off; use IMM(), RBPF(100) or BootstrapPF(1000)."
+    )
+    assert jump_problem(compiled, psf.IMM()) is None
 
 
 def test_a_filter_is_exact_or_approximate():

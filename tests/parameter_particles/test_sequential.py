@@ -144,7 +144,7 @@ def test_an_extension_that_disagrees_is_refused(by_filter):
     refused(DataMismatchError, r"steps\[0\] = 0 lies before", observed=[9.0], steps=[0])
     seen = {"observed": DATA[-2:], "steps": STEPS[-2:]}
     refused(ModelError, "go on after the last row seen", **seen)
-    refused(ModelError, "exactly one of steps and times", observed=[9.0])
+    refused(ModelError, "observed brings no dates: give steps or times", observed=[9.0])
     new = {"observed": [9.0], "steps": [30]}
     refused(DataMismatchError, "model must be that of idata", of=model(psf.UKF()), **new)
     with pm.Model() as other:

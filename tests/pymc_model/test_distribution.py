@@ -204,7 +204,7 @@ def test_times_in_place_of_steps():
         ({"observed": [1, np.inf, 3, 4]}, r"got observed\[1\] = inf"),
         ({"observed": "data.csv"}, "observed must be numbers, got 'data.csv'"),
         ({"times": STEPS * 1.0}, "give exactly one of steps and times"),
-        ({"steps": None}, "give exactly one of steps and times"),
+        ({"steps": None}, "observed brings no dates: give steps or times"),
         ({"steps": STEPS * 1.0}, r"steps must be a vector of integers.*\.astype\(int\)"),
         ({"steps": pytensor.shared(STEPS * 1.0)}, "steps must be a vector of integers"),
         ({"steps": [0, 2, 2, 6]}, r"got steps\[1\] = 2 followed by 2"),

@@ -401,7 +401,8 @@ def negative():
     ("call", "message"),
     [
         (lambda: psf.drifting(pushed(), k=psf.RandomWalk()), r"k must be a parameter.*'gain'"),
-        (lambda: psf.drifting(pushed(), a=psf.RandomWalk), r"a must be psf.RandomWalk\(...\)"),
+        (lambda: psf.drifting(pushed(), a=psf.RandomWalk), r"a class: write psf.RandomWalk\(\)"),
+        (lambda: psf.drifting(pushed(), a=0.1), r"a must be psf.RandomWalk\(...\)"),
         (lambda: psf.drifting(pushed()), "give a process for at least one parameter"),
         (lambda: psf.drifting(3, a=psf.RandomWalk()), "system must be a StateSpaceModel, got 3"),
         (lambda: psf.RandomWalk(every=0), "every must be an integer of at least 1, got 0"),

@@ -101,7 +101,7 @@ def test_parameters_are_shared_or_of_each_record():
         ({"labels": LABELS[:4]}, r"steps must have shape \(4,\)"),
         ({"steps": [0, 3, 1, 2, 2]}, r"record 'c', whose first row is 3: steps must increase"),
         ({"steps": [0, 3, -1, 0, 2]}, r"record 'a', whose first row is 2: steps must not be neg"),
-        ({"steps": None}, "exactly one of steps and times"),
+        ({"steps": None}, "observed brings no dates: give steps or times"),
         ({"steps": None, "times": [0, 3, 1.5, 0, 2]}, r"record 'a', whose first row is 2: times"),
         ({"observed": DATA[:4]}, r"observed must have shape \(5, 1\)"),
         ({"inputs": FORCE[:2]}, "record 'b', whose first row is 0: inputs must have at least 3"),

@@ -109,6 +109,27 @@ def test_a_function_has_whole_steps_and_an_integrator_of_one_length_is_named():
             psf.log_likelihood(system, psf.EKF(), {}, [0.0], times=[0.3])
 
 
+def test_a_record_off_the_grid_names_its_rows_and_the_call_that_rounds():
+    system = psf.StateSpaceModel(
+        transition=lambda x, q: [x[0] + q[0]], process_noise=[[1.0]], **SETTINGS
+    )
+    start = pd.Timestamp("2024-05-01")
+    dates = pd.DatetimeIndex(["2024-05-01", "2024-05-01 05:00", "2024-05-02"])
+    given = dict(times=dates, unit="h", t0=start - pd.Timedelta("1h"))
+    with pytest.raises(ModelError, match=r"^times\[1\] = .*05:00.* is off") as caught:
+        psf.log_likelihood(system, psf.EKF(), {}, np.zeros(3), times=dates, unit=pd.Timedelta("2h"))
+    assert "t0 = 2024-05-01T00:00" in str(caught.value)
+    assert "nearest_steps(dates, dt, t0=t0, unit=pd.Timedelta('0 days 02:00:00'))" in str(
+        caught.value
+    )
+    with pytest.raises(ModelError, match='unit="h"'):
+        psf.log_likelihood(
+            system, psf.EKF(), {}, np.zeros(3), **given | {"times": dates + pd.Timedelta("7min")}
+        )
+    with pytest.raises(ModelError, match=r"all 2 rows of times, the first at 0\.3, are off"):
+        psf.log_likelihood(system, psf.EKF(), {}, np.zeros(2), times=[0.3, 0.7])
+
+
 # Likelihoods.
 
 
@@ -394,7 +415,7 @@ def test_dates_that_are_refused(settings, message):
 
 def test_an_index_without_dates_is_named():
     for index in (DATES.astype(str), None):
-        with pytest.raises(ModelError, match=r"index of observed.*pd.to_datetime.*no dates"):
+        with pytest.raises(ModelError, match=r"brings no dates.*pd.to_datetime.*got the index"):
             checked_record(EXACT, GivenRecord(pd.Series(DATA, index=index)))
 
 

@@ -47,9 +47,9 @@ def drift_scan(
     r"""Scan a model of constant parameters for those that vary in time, and when.
 
     For each parameter the scores, the derivatives of the terms
-    :math:`\log p(d_j | d_1 \dots d_{j-1})` by it, are summed along the record. Of a constant
-    parameter the sum wanders about zero; where the parameter changes the sum turns. Nyblom's
-    statistic measures that. It needs no chains of a drifting model.
+    :math:`\log p(d_j | d_1 \dots d_{j-1})` with respect to it, are summed along the record.
+    The sum of a constant parameter wanders about zero; where the parameter changes the sum turns.
+    Nyblom's statistic measures that. It needs no chains of a drifting model.
 
     Parameters
     ----------
@@ -110,11 +110,11 @@ def drift_scan(
     nearly right gives the right p-values. They hold for records that are long enough for estimates
     to be nearly normal.
 
-    In a panel each record has a path of its own.
+    In a panel each record has its own path.
 
-    A change of one parameter moves the sums of those whose scores are correlated with its own,
-    too, less than its own: look at the first row. A large change of any makes large residuals,
-    after which a noise seems to vary as well.
+    A change of one parameter also changes the sums of parameters whose scores are correlated with
+    its own, but less: consider the first row first. A large change of a parameter leaves large
+    residuals, so that a noise parameter may seem to vary as well.
 
     References
     ----------

@@ -54,8 +54,8 @@ def drift_evidence(
 
     The constant model is that with the strength of the drift at zero,
     ``pm.do(model, {"beta_strength": 0.0})``: the priors of all other variables stay, and those that
-    the strength makes superfluous, as the rate of an `OrnsteinUhlenbeck`, have no influence. It
-    needs no draws of its own: its evidence over that of the drifting model is an
+    a strength of zero makes irrelevant, such as the rate of an `OrnsteinUhlenbeck`, have no
+    influence. It needs no draws of its own: its evidence over that of the drifting model is an
     importance-weighted marginal density estimate (Chen 1994).
 
     Parameters
@@ -126,7 +126,7 @@ def drift_evidence(
 
     The likelihood depends on the *square* of the strength, so that the null hypothesis is at the
     boundary of the support; the draws of a strength are on the log scale, where zero is at minus
-    infinity, so that no density fitted to them answers the question.
+    infinity, so that a density fitted to them has no value at zero.
 
     References
     ----------
