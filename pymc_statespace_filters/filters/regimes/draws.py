@@ -117,7 +117,7 @@ def _rule(d: int) -> tuple[Array, Array]:
     others = np.kron(np.eye(d - 1), np.sqrt(d - 1) * line[:, None])
     weights_of_others = np.tile(weights_on_line / (d - 1), d - 1)
     nodes = np.column_stack([np.repeat(first, len(others)), np.tile(others, (N_FIRST, 1))])
-    return nodes, np.kron(weights, weights_of_others)
+    return nodes, np.asarray(np.kron(weights, weights_of_others), dtype=np.float64)
 
 
 def _gauss_hermite(n: int) -> tuple[Array, Array]:
