@@ -69,8 +69,8 @@ def _given(
         root = root @ _reflection(root.T @ graph_replace(slope, {x: mean}, strict=False))
     nodes, weights = _rule(len(hybrid.deciding))
     at = [graph_replace(probability, {x: mean + root @ node}, strict=False) for node in nodes]
-    joint = pt.stack([weight * p for weight, p in zip(weights, at, strict=True)])
-    total = pt.sum(joint)
+    joint = pt.stack(at) * weights
+    total = pt.stack(at) @ weights  # sums of more than 32 terms are not for every backend
     is_possible = pt.neq(total, 0.0)
     share = pt.switch(is_possible, joint / pt.switch(is_possible, total, 1.0), weights)
     first = share @ nodes
