@@ -5,8 +5,8 @@ over that of a wide prior. A run that is off by more than 3 of its errors should
 `EvidenceWarning`. Run it with ``python -m benchmarks.smc 20`` from the root of the repository, for
 20 seeds.
 
-With 15 seeds, 1 of 60 runs on wells and banana was off and not marked. On the funnel the mass of the
-neck was off in all of 4 runs (2 seeds), of which 3 were marked.
+With 15 seeds, 1 of 60 runs on wells and banana was off and not marked. On the funnel the mass of
+the neck was off in all of 4 runs (2 seeds), of which 3 were marked.
 """
 
 import sys
