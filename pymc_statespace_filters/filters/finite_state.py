@@ -19,11 +19,12 @@ from .markov_chain.predictions import PREDICTIONS_OF_CHAIN
 from .markov_chain.states import MOMENTS, RUN_OF_CHAIN, STATES_OF_CHAIN
 from .plan import make_plan
 from .protocol import System, check_sensor_has_noise
-from .signatures import GRADIENT, LIKELIHOOD_OF_NOISE, PREDICTIONS, PULLBACK, RUN, STATES, TAPED
+from .signatures import PREDICTIONS, RUN, STATES
+from .taped import TapedFilter
 
 
 @dataclass(frozen=True)
-class FiniteStateFilter:
+class FiniteStateFilter(TapedFilter):
     """Forward algorithm: the exact likelihood of a system whose states take finitely many values.
 
     For hidden Markov models, Markov-switching regressions and counts in a small population. Every
@@ -84,8 +85,6 @@ class FiniteStateFilter:
     values: Mapping[str, int | Sequence[float]] | None = None
     declared: Declared = field(default=(), init=False, repr=False)
 
-    noisy: ClassVar[bool] = False
-    has_gradient: ClassVar[bool] = True
     finds_path: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -142,26 +141,10 @@ class FiniteStateFilter:
         """
         return is_smooth_in_parameters(system.model)
 
-    def compile(self, system: System) -> PlannedFunction:
-        """Compile the log-likelihood."""
-        return PlannedFunction(self._plan(system, FORWARD), *LIKELIHOOD_OF_NOISE)
-
-    def compile_taped(self, system: System) -> PlannedFunction:
-        """Compile the forward pass, with a third result: the tape."""
-        return PlannedFunction(self._plan(system, FORWARD, leaves_tape=True), *TAPED)
-
-    def compile_pullback(self, system: System) -> PlannedFunction:
-        """Compile the backward pass along the tape."""
-        return PlannedFunction(self._plan(system, BACKWARD), *PULLBACK)
-
-    def compile_gradient(self, system: System) -> PlannedFunction:
-        """Compile both passes as one function."""
-        return PlannedFunction(self._plan(system, BACKWARD, leaves_tape=True), *GRADIENT)
-
-    def plan_of_many(
+    def plan_of_pass(
         self, system: System, *, leaves_tape: bool = False, goes_back: bool = False
     ) -> Plan:
-        """Plan a pass along many records, or of many points."""
+        """Plan a pass along a record; one that leaves a tape and goes back is the gradient."""
         return self._plan(system, BACKWARD if goes_back else FORWARD, leaves_tape=leaves_tape)
 
     def compile_states(self, system: System, moment: str) -> PlannedFunction:

@@ -1,16 +1,16 @@
 """Interacting multiple model filter: a Gaussian for each regime of a system that switches."""
 
 from dataclasses import KW_ONLY, dataclass, field
+from typing import NoReturn
 
 from ..compiler.lowering.compiled_system import compile_system
 from ..compiler.native.planned_function import PlannedFunction
-from ..errors import ModelError
 from .ekf import EKF
 from .gaussian.base import GaussianFilterBase
 from .gaussian.functions import GaussianFilterFunctions
 from .iplf import IPLF
 from .protocol import System
-from .regimes.checks import check_hybrid, check_inner
+from .regimes.checks import check_hybrid, check_inner, refuse_smoothing
 from .regimes.hybrid import hybrid_of
 from .regimes.mixture import mixture_functions
 from .regimes.mixture_states import states_plan
@@ -106,12 +106,9 @@ class IMM(GaussianFilterBase):
         plan = states_plan(system, hybrid, self._functions(system), moment)
         return PlannedFunction(plan, *STATES)
 
-    def smoothing_method(self, system: System) -> str:
+    def smoothing_method(self, system: System) -> NoReturn:
         """Raise: the filter has no smoother."""
-        raise ModelError(
-            "IMM gives no smoothed states; name a filter that does, such as "
-            "filter=psf.BootstrapPF(1000)"
-        )
+        refuse_smoothing("IMM")
 
     def _functions(self, system: System) -> GaussianFilterFunctions:
         return mixture_functions(system.model, self.inner.linearization)

@@ -220,7 +220,8 @@ def settings_of(plan):
 
 
 @njit_internal
-def _call(address, system, k, t, z, width, X, out):
+def call_members(address, system, k, t, z, width, X, out):
+    """Call a function of a system for all members X at once."""
     arguments = MemberArguments(
         c=system.c, inputs=system.inputs, k=k, t=t, z=z, width=width, X=X, out=out,
         n_members=np.int64(X.shape[1]),
@@ -231,31 +232,31 @@ def _call(address, system, k, t, z, width, X, out):
 @njit_internal
 def initialise(system, z, width, X):
     """Draw every member's state at step 0 from normals at the address z."""
-    _call(system.initialise, system, NULL, 0.0, z, width, X, NULL)
+    call_members(system.initialise, system, NULL, 0.0, z, width, X, NULL)
 
 
 @njit_internal
 def propagate(system, k, t, z, width, X):
     """Move every member from step k to k + 1 with its own noise (Eqs. 4.22 and 4.40)."""
-    _call(system.propagate, system, k, t, z, width, X, NULL)
+    call_members(system.propagate, system, k, t, z, width, X, NULL)
 
 
 @njit_internal
 def observe(system, k, t, z, width, X, D):
     """Simulate an observation of every member (Eq. 4.15)."""
-    _call(system.observe, system, k, t, z, width, X, D)
+    call_members(system.observe, system, k, t, z, width, X, D)
 
 
 @njit_internal
 def log_density(system, k, t, d, X, log_p):
     """Write log p(d | x) of every member; components of d that are NaN are left out."""
-    _call(system.log_density, system, k, t, d, NULL, X, log_p)
+    call_members(system.log_density, system, k, t, d, NULL, X, log_p)
 
 
 @njit_internal
 def propagate_guided(system, k, t, z, width, X, gains):
     """Move every member by noise that these gains shift; X is followed by a row of log ratios."""
-    _call(system.propagate_guided, system, k, t, z, width, X, gains)
+    call_members(system.propagate_guided, system, k, t, z, width, X, gains)
 
 
 @njit_internal
@@ -280,10 +281,10 @@ def look_back(address, first, last, path, steps, gains, psi, sums):
 @njit_internal
 def observation_information(system, k, t, d, x, out):
     """Write log p(d | x) at a point x (n, 1), its score and its information."""
-    _call(system.observation_information, system, k, t, d, NULL, x, out)
+    call_members(system.observation_information, system, k, t, d, NULL, x, out)
 
 
 @njit_internal
 def step_moments(system, k, t, X, M):
     """Write mean and variance of the next state, given each point X (1, N), to M (2, N)."""
-    _call(system.step_moments, system, k, t, NULL, NULL, X, M)
+    call_members(system.step_moments, system, k, t, NULL, NULL, X, M)

@@ -6,34 +6,32 @@ front of an observation, which tries all that may happen. See `regimes.particles
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field
-from typing import ClassVar
+from typing import ClassVar, NoReturn
 
 import numpy as np
 
-from ..compiler.codegen.arguments import MemberArguments
 from ..compiler.lowering.compiled_system import compile_system
-from ..compiler.native.entry_point import EntryPoint, call_address
+from ..compiler.native.entry_point import EntryPoint
 from ..compiler.native.jit import copy_into, njit_internal
 from ..compiler.native.plan import NORMALS, STATE, Plan
 from ..compiler.native.planned_function import PlannedFunction
 from ..compiler.numerics.normals import FILL_NORMALS, padded
-from ..errors import ModelError
 from .calls import OK, likelihood_entry, state_given
 from .ekf import EKF
-from .ensemble.callbacks import ENDED, FORECAST, RESAMPLED, UPDATED, emit
+from .ensemble.callbacks import FORECAST, RESAMPLED, UPDATED, emit
 from .ensemble.failures import failure_of_all
 from .ensemble.kalman_update import mark_finite
 from .ensemble.loop import (
     N_LEADING,
     Members,
-    dump,
+    begin,
+    finish,
     new_members,
     noise_of_rank,
     observer_of,
     rank_of,
-    restore,
 )
-from .ensemble.noise import NoiseSizes, initial_normals, process_normals, resampling_normals
+from .ensemble.noise import NoiseSizes, process_normals, resampling_normals
 from .ensemble.particle_filter import ParticleFilter
 from .ensemble.reductions import local_partition
 from .ensemble.resampling import check_sortable, resample_if_few, resampler, smooth_resampling
@@ -41,23 +39,14 @@ from .ensemble.summaries import LAST_EVENTS
 from .ensemble.weights import normalise_weights
 from .iplf import IPLF
 from .outcomes import NONE, is_missing
-from .plan import NULL, PLAN, initialise, make_plan, propagate, read_system, settings_of
+from .plan import NULL, PLAN, call_members, make_plan, propagate, read_system, settings_of
 from .protocol import System
-from .regimes.checks import check_hybrid, check_inner
+from .regimes.checks import check_hybrid, check_inner, refuse_smoothing
 from .regimes.hybrid import hybrid_of
 from .regimes.particle_states import RUN_OF_MIXTURE, STATES_OF_MIXTURE, SUMMARISE_MIXTURE
 from .regimes.particles import HybridParticles, hybrid_particles
 from .signatures import RUN, STATES
 from .ukf import UKF
-
-
-@njit_internal
-def _call(address, system, k, t, z, width, X, out):
-    arguments = MemberArguments(
-        c=system.c, inputs=system.inputs, k=k, t=t, z=z, width=width, X=X, out=out,
-        n_members=np.int64(X.shape[1]),
-    )  # fmt: skip
-    call_address(address, arguments)
 
 
 @njit_internal
@@ -114,13 +103,8 @@ def _evaluate(plan, record, request, seed, to):
     if system.failure != NONE:
         health[0], health[1], health[2] = 0.0, system.failure, 0.0
     nothing, ancestors = np.empty(0), resampling.ancestors
-    k, before = np.int64(0), state_given(request)
-    if before.size == 0:
-        initialise(system, initial_normals(noise), width, members.X)
-        emit(observer, FORECAST, -1, k, members, nothing, ancestors)
-    elif before.size == plan[PLAN.state_size] and noise.stored.size == 0:
-        k = restore(before, members)
-    else:
+    k = begin(plan, system, state_given(request), noise, width, members, observer, ancestors)
+    if k < 0:
         return STATE
     for j in range(steps.size if health[1] == NONE else 0):
         d, missing = record.observed[j], is_missing(record.observed, j)
@@ -137,10 +121,10 @@ def _evaluate(plan, record, request, seed, to):
             seen = _seen_at(system, d, k + 1, t0 + (k + 1) * dt)
             z = process_normals(noise, k)
             address = np.int64(seen.ctypes.data)
-            _call(plan[PLAN.move_to_observation], system, k, t, z, width, members.X, address)
+            call_members(plan[PLAN.move_to_observation], system, k, t, z, width, members.X, address)
             k += 1
         else:
-            _call(plan[PLAN.condition], system, k, t0 + k * dt, d, NULL, members.X, NULL)
+            call_members(plan[PLAN.condition], system, k, t0 + k * dt, d, NULL, members.X, NULL)
         increment, n_effective = _weigh(members, log_density, local)
         to.n_effective[j] = n_effective
         health[0] = min(health[0], n_effective)
@@ -154,12 +138,7 @@ def _evaluate(plan, record, request, seed, to):
         log_w, w = members.log_w, members.w
         if resample_if_few(resampling, n_effective, z, log_w, w, members.X, local):
             emit(observer, RESAMPLED, j, k, members, nothing, ancestors)
-    if health[1] == NONE:
-        emit(observer, ENDED, steps.size, k, members, nothing, ancestors)
-    if to.state.size:
-        dump(k, members, to.state)
-        if health[1] != NONE:
-            to.state[:] = np.nan
+    finish(steps.size, k, members, observer, ancestors, to)
     return OK
 
 
@@ -276,12 +255,9 @@ class RBPF(ParticleFilter):
         last_event = LAST_EVENTS[moment]
         return self.observed(system, run, observer=SUMMARISE_MIXTURE, last_event=last_event)
 
-    def smoothing_method(self, system: System) -> str:
+    def smoothing_method(self, system: System) -> NoReturn:
         """Raise: the filter has no smoother."""
-        raise ModelError(
-            "RBPF gives no smoothed states; name a filter that does, such as "
-            "filter=psf.BootstrapPF(1000)"
-        )
+        refuse_smoothing("RBPF")
 
     def plan(
         self, system: System, run: EntryPoint, functions: Sequence[str], **others: int | EntryPoint

@@ -45,6 +45,11 @@ class DriftProcess:
 
         ``start`` is the number at the start, and ``values`` are those of ``parameters``.
         """
+        returned, spread = self._step(length, *values)
+        return returned * (now - start) + spread * noise
+
+    def _step(self, length: Any, *values: TensorVariable) -> tuple[Any, TensorVariable]:
+        """What a step adds of the distance from the start, and its standard deviation."""
         raise NotImplementedError
 
 
@@ -79,17 +84,9 @@ class RandomWalk(DriftProcess):
     RandomWalk(scale='log', every=7)
     """
 
-    def move(
-        self,
-        now: TensorVariable,
-        start: TensorVariable,
-        noise: TensorVariable,
-        length: Any,
-        values: Sequence[TensorVariable],
-    ) -> TensorVariable:
-        """What a time ``length`` adds to the number on the scale."""
+    def _step(self, length: Any, *values: TensorVariable) -> tuple[Any, TensorVariable]:
         (strength,) = values
-        return strength * root_of(length) * noise
+        return 0.0, strength * root_of(length)
 
 
 @dataclass(frozen=True)
@@ -124,15 +121,7 @@ class OrnsteinUhlenbeck(DriftProcess):
 
     parameters: ClassVar[tuple[str, ...]] = ("strength", "rate")
 
-    def move(
-        self,
-        now: TensorVariable,
-        start: TensorVariable,
-        noise: TensorVariable,
-        length: Any,
-        values: Sequence[TensorVariable],
-    ) -> TensorVariable:
-        """What a time ``length`` adds to the number on the scale."""
+    def _step(self, length: Any, *values: TensorVariable) -> tuple[Any, TensorVariable]:
         strength, rate = values
         spread = pt.sqrt(-pt.expm1(-2.0 * rate * length) / (2.0 * rate))
-        return pt.expm1(-rate * length) * (now - start) + strength * spread * noise
+        return pt.expm1(-rate * length), strength * spread

@@ -375,7 +375,7 @@ REFUSED = [
     ),
     (
         dict(process_dist=lambda x: [pm.DiscreteUniform.dist(0, 9), pm.Normal.dist(0, 1)]),
-        "at most 64 ways from regime to regime, this system has 100",
+        "at most 64 transitions between regimes, this system has 100",
     ),
 ]
 

@@ -123,7 +123,7 @@ def no_resampling(resampler, noise, j, k, n_weighted, members, local):
 
 
 @njit_internal
-def dump(k, members, state):
+def _dump(k, members, state):
     """Write the step, the members and their log weights to a vector."""
     n, N = members.X.shape
     state[0] = k
@@ -133,13 +133,37 @@ def dump(k, members, state):
 
 
 @njit_internal
-def restore(state, members):
-    """Read what `dump` wrote; returns the step."""
+def _restore(state, members):
+    """Read what `_dump` wrote; returns the step."""
     n, N = members.X.shape
     for a in range(n):
         copy_into(members.X[a], state[1 + a * N : 1 + (a + 1) * N])
     copy_into(members.log_w, state[1 + n * N :])
     return np.int64(state[0])
+
+
+@njit_internal
+def begin(plan, system, given, noise, width, members, observer, ancestors):
+    """Draw the members at step 0, or take those of a state; the step, or -1 of another state."""
+    if given.size == 0:
+        initialise(system, initial_normals(noise), width, members.X)
+        emit(observer, FORECAST, -1, np.int64(0), members, np.empty(0), ancestors)
+        return np.int64(0)
+    if given.size == plan[PLAN.state_size] and noise.stored.size == 0:
+        return _restore(given, members)
+    return np.int64(-1)
+
+
+@njit_internal
+def finish(n_rows, k, members, observer, ancestors, to):
+    """Tell that a record has ended, unless it has failed, and write the state if it is wanted."""
+    is_known = to.health[1] == NONE
+    if is_known:
+        emit(observer, ENDED, n_rows, k, members, np.empty(0), ancestors)
+    if to.state.size:
+        _dump(k, members, to.state)
+        if not is_known:
+            to.state[:] = np.nan
 
 
 def ensemble_filter(
@@ -197,13 +221,8 @@ def ensemble_filter(
             health[0], health[1], health[2] = 0.0, system.failure, 0.0
         nothing, ancestors = np.empty(0), resampling.ancestors
         origins = new_origins(plan[PLAN.follows_origins] != 0, local)
-        k, before = np.int64(0), state_given(request)
-        if before.size == 0:
-            initialise(system, initial_normals(noise), width, members.X)
-            emit(observer, FORECAST, -1, k, members, nothing, ancestors)
-        elif before.size == plan[PLAN.state_size] and noise.stored.size == 0:
-            k = restore(before, members)
-        else:
+        k = begin(plan, system, state_given(request), noise, width, members, observer, ancestors)
+        if k < 0:
             return STATE
         for j in range(steps.size if health[1] == NONE else 0):
             while k < steps[j]:
@@ -229,12 +248,7 @@ def ensemble_filter(
             if resample(resampling, noise, j, k, found.n_weighted, members, local):
                 follow_ancestors(origins, ancestors)
                 emit(observer, RESAMPLED, j, k, members, nothing, ancestors)
-        if health[1] == NONE:
-            emit(observer, ENDED, steps.size, k, members, nothing, ancestors)
-        if to.state.size:
-            dump(k, members, to.state)
-            if health[1] != NONE:
-                to.state[:] = np.nan
+        finish(steps.size, k, members, observer, ancestors, to)
         return OK
 
     parts = (str(n_settings), workspace, update, resampler, resample)

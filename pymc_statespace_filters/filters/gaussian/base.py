@@ -15,7 +15,8 @@ from ...compiler.native.planned_function import PlannedFunction
 from ...errors import ModelError
 from ...system.model import StateSpaceModel
 from ..protocol import System, check_sensor_has_noise
-from ..signatures import GRADIENT, LIKELIHOOD_OF_NOISE, PULLBACK, RUN, STATES, TAPED
+from ..signatures import RUN, STATES
+from ..taped import TapedFilter
 from .backward import BACKWARD
 from .forward import FORWARD
 from .functions import GaussianFilterFunctions, filter_plan
@@ -32,11 +33,9 @@ from .states import RUN as RUN_STATES
 from .states import states_plan
 
 
-class GaussianFilterBase:
+class GaussianFilterBase(TapedFilter):
     """Compiles a filter from its ``linearization``."""
 
-    noisy: ClassVar[bool] = False
-    has_gradient: ClassVar[bool] = True
     resumes: ClassVar[bool] = True
 
     @property
@@ -58,21 +57,11 @@ class GaussianFilterBase:
         """Whether the likelihood has no kinks or jumps along a parameter; False if unknown."""
         return system.is_smooth
 
-    def compile(self, system: System) -> PlannedFunction:
-        """Compile the log-likelihood."""
-        return PlannedFunction(self._plan(system, FORWARD), *LIKELIHOOD_OF_NOISE)
-
-    def compile_taped(self, system: System) -> PlannedFunction:
-        """Compile the forward pass, with a third result: the tape."""
-        return PlannedFunction(self._plan(system, FORWARD, leaves_tape=True), *TAPED)
-
-    def compile_pullback(self, system: System) -> PlannedFunction:
-        """Compile the backward pass along the tape."""
-        return PlannedFunction(self._plan(system, BACKWARD), *PULLBACK)
-
-    def compile_gradient(self, system: System) -> PlannedFunction:
-        """Compile both passes as one function."""
-        return PlannedFunction(self._plan(system, BACKWARD, leaves_tape=True), *GRADIENT)
+    def plan_of_pass(
+        self, system: System, *, leaves_tape: bool = False, goes_back: bool = False
+    ) -> Plan:
+        """Plan a pass along a record; one that leaves a tape and goes back is the gradient."""
+        return self._plan(system, BACKWARD if goes_back else FORWARD, leaves_tape=leaves_tape)
 
     def plan_of_many(
         self, system: System, *, leaves_tape: bool = False, goes_back: bool = False

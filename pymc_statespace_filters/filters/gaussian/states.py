@@ -136,21 +136,37 @@ def _states(plan, record, request, results):
 @njit_internal
 def _read_forwards(n, is_predicted, table, tape, end, rows, mean, sd, drawn):
     """Write predicted or filtered states at the rows; return how many rows have a state."""
-    steps, j = table.rows[:, 0], 0
-    size = n + n * (n + 1) // 2
-    for r in range(rows.size):
-        k = rows[r]
+    places, size = places_on_tape(rows, table.rows[:, 0], end, is_predicted), n + n * (n + 1) // 2
+    for r in range(places.size):
+        s = tape[places[r]]
+        read_moments(s, mean[r], sd[r])
+        for i in range(n):
+            drawn[r, i] = s[i] + s[size + i]
+    return places.size
+
+
+@njit_internal
+def places_on_tape(rows, steps, end, is_predicted):
+    """Where the tape has the states at rows, those in front of step ``end``."""
+    places, n_known, j = np.empty(rows.size, np.int64), 0, 0
+    for k in rows:
         if k >= end:
-            return r
+            break
         while j < steps.size and steps[j] < k:
             j += 1
         is_seen = j < steps.size and steps[j] == k
-        s = tape[k + j + (is_seen and not is_predicted)]
-        for i in range(n):
-            mean[r, i] = s[i]
-            sd[r, i] = np.sqrt(max(s[n + i * (i + 3) // 2], 0.0))
-            drawn[r, i] = s[i] + s[size + i]
-    return rows.size
+        places[n_known] = k + j + (is_seen and not is_predicted)
+        n_known += 1
+    return places[:n_known]
+
+
+@njit_internal
+def read_moments(s, mean, sd):
+    """Write mean and standard deviations from a state: a mean, and a lower triangle by rows."""
+    n = mean.size
+    for i in range(n):
+        mean[i] = s[i]
+        sd[i] = np.sqrt(max(s[n + i * (i + 3) // 2], 0.0))
 
 
 @njit_internal

@@ -1,7 +1,5 @@
 """The law of every observation given those before it: a mixture over the predicted states."""
 
-import math
-
 import numpy as np
 
 from ...compiler.native.jit import njit_internal
@@ -9,7 +7,7 @@ from ...compiler.native.plan import RECORD, REQUEST, RESULTS, plan_entry
 from ..calls import OK, opened, reals_at, single_record
 from ..outcomes import NONE
 from ..plan import PLAN, read_system
-from ..point_mass.predictions import Laws, forget, observations_at, write_mixture_moments
+from ..point_mass.predictions import Laws, forget, observations_at, write_mixture
 from .forward import forward_pass, rows_on_tape
 from .machine import read_chain
 from .states import predicted_at_observations
@@ -20,18 +18,7 @@ def _write_law(system, chain, record, j, weights, laws):
     """Write the law of an observation from the probabilities of the states before it."""
     k = record.steps[j]
     h, roots = observations_at(system, k, record.t0 + k * chain.dt, chain.X)
-    write_mixture_moments(weights, 1.0, h, roots, laws.mean[j], laws.cov[j])
-    for b in range(chain.p):
-        below, above = 0.0, 0.0
-        for i in range(weights.size):
-            variance = 0.0
-            for a in range(chain.p):
-                variance += roots[a, b, i] * roots[a, b, i]
-            z = (record.observed[j, b] - h[b, i]) / math.sqrt(2.0 * variance)
-            if weights[i] > 0.0:
-                below += 0.5 * weights[i] * math.erfc(-z)
-                above += 0.5 * weights[i] * math.erfc(z)
-        laws.log_below[j, b], laws.log_above[j, b] = math.log(below), math.log(above)
+    write_mixture(weights, 1.0, 1, h, roots, record.observed[j], laws, j)
 
 
 def _predictions(plan, record, request, results):

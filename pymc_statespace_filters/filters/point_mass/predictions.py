@@ -108,20 +108,7 @@ def _write_law(tape, k, X, mass, n_together):
     laws.next[0] = j + 1
     h, roots = observations_at(system, k, t0 + k * system.dt, X)
     weight = 1.0 / total_mass(mass)
-    write_mixture_moments(mass, weight, h, roots, laws.mean[j], laws.cov[j])
-    for b in range(system.p):
-        below, above = 0.0, 0.0
-        for i in range(mass.size):
-            variance = 0.0
-            for a in range(system.p):
-                variance += roots[a, b, i] * roots[a, b, i]
-            first = i - i % n_together
-            variance += _variance_of_cell(h[b, first : first + n_together], i - first, variance)
-            z = (observed[j, b] - h[b, i]) / math.sqrt(2.0 * variance)
-            if mass[i] > 0.0:
-                below += 0.5 * weight * mass[i] * math.erfc(-z)
-                above += 0.5 * weight * mass[i] * math.erfc(z)
-        laws.log_below[j, b], laws.log_above[j, b] = math.log(below), math.log(above)
+    write_mixture(mass, weight, n_together, h, roots, observed[j], laws, j)
 
 
 @njit_internal
@@ -153,7 +140,27 @@ def _variance_of_cell(h, i, noise_variance):
 
 
 @njit_internal
-def write_mixture_moments(mass, weight, h, roots, mean, cov):
+def write_mixture(mass, weight, n_together, h, roots, d, laws, j):
+    """Write the law of row j, a mixture of normals at masses that add up to 1 / weight."""
+    _write_mixture_moments(mass, weight, h, roots, laws.mean[j], laws.cov[j])
+    p = d.size
+    for b in range(p):
+        below, above = 0.0, 0.0
+        for i in range(mass.size):
+            variance = 0.0
+            for a in range(p):
+                variance += roots[a, b, i] * roots[a, b, i]
+            first = i - i % n_together
+            variance += _variance_of_cell(h[b, first : first + n_together], i - first, variance)
+            z = (d[b] - h[b, i]) / math.sqrt(2.0 * variance)
+            if mass[i] > 0.0:
+                below += 0.5 * weight * mass[i] * math.erfc(-z)
+                above += 0.5 * weight * mass[i] * math.erfc(z)
+        laws.log_below[j, b], laws.log_above[j, b] = math.log(below), math.log(above)
+
+
+@njit_internal
+def _write_mixture_moments(mass, weight, h, roots, mean, cov):
     """Mean and covariance of the mixture."""
     p = mean.size
     for b in range(p):

@@ -1,6 +1,6 @@
 """Which systems filters of regimes take, and with which Gaussian filters inside."""
 
-from typing import Any
+from typing import Any, NoReturn
 
 from ...compiler.lowering.compiled_system import compile_system
 from ...errors import ModelError
@@ -18,6 +18,14 @@ def check_inner(inner: Any) -> None:
     """Raise unless this is a Gaussian filter of the states given the regimes."""
     if not isinstance(inner, EKF | UKF | IPLF):
         raise ModelError(f"inner must be psf.EKF(), psf.UKF() or psf.IPLF(), got {inner!r}")
+
+
+def refuse_smoothing(name: str) -> NoReturn:
+    """Raise: the filter has no smoother."""
+    raise ModelError(
+        f"{name} gives no smoothed states; name a filter that does, such as "
+        "filter=psf.BootstrapPF(1000)"
+    )
 
 
 def check_hybrid(name: str, system: System, inner: EKF | UKF | IPLF) -> Hybrid:
@@ -59,6 +67,6 @@ def _check_moves(name: str, hybrid: Hybrid) -> None:
     n_branches = len(found.step.origin)
     if n_branches > MOST_BRANCHES:
         raise ModelError(
-            f"{name} takes at most {MOST_BRANCHES} ways from regime to regime, this system has "
-            f"{n_branches} between {len(hybrid.regimes)} regimes"
+            f"{name} takes at most {MOST_BRANCHES} transitions between regimes, this system has "
+            f"{n_branches} for {len(hybrid.regimes)} regimes"
         )

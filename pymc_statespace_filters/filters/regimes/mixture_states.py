@@ -14,7 +14,14 @@ from ..gaussian.functions import (
 )
 from ..gaussian.group import parameters_of, set_all, table_of
 from ..gaussian.machine import read_machine
-from ..gaussian.states import MOMENTS, new_health, room, taped_pass
+from ..gaussian.states import (
+    MOMENTS,
+    new_health,
+    places_on_tape,
+    read_moments,
+    room,
+    taped_pass,
+)
 from ..plan import PLAN, make_plan, settings_of
 from ..protocol import System
 from .hybrid import Hybrid
@@ -74,20 +81,12 @@ def _states(plan, record, request, results):
     table = table_of(opening, parameters_of(opening), np.empty((0, 0)), np.empty(0))
     tape, end = taped_pass(opening, machine, given[_N_HEADER:first], table, health)
     is_predicted = opening.plan[PLAN.last_event] == 0
-    steps, j = table.rows[:, 0], 0
-    for r in range(n_wanted):
-        k = rows[r]
-        if k >= end:
-            break
-        while j < steps.size and steps[j] < k:
-            j += 1
-        is_seen = j < steps.size and steps[j] == k
-        s = tape[k + j + (is_seen and not is_predicted)]
-        for i in range(n):
-            mean[r, i] = s[i]
-            sd[r, i] = np.sqrt(max(s[n + i * (i + 3) // 2], 0.0))
+    places = places_on_tape(rows, table.rows[:, 0], end, is_predicted)
+    for r in range(places.size):
+        s = tape[places[r]]
+        read_moments(s, mean[r], sd[r])
         w, X = _parts(s, n, n_finite, regimes)
-        draw_of_mixture(w, X, n_finite, order, seed, k, drawn[r])
+        draw_of_mixture(w, X, n_finite, order, seed, rows[r], drawn[r])
         set_all(n_effective[r], np.inf)
     return OK
 

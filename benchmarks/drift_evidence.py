@@ -2,10 +2,11 @@
 
 The gain of a linear system is constant in half of the records and drifts in the others; strength
 and parameters are drawn from their priors. The `EKF` is exact there, so that of all records with a
-reported probability p of drift a share p must drift. ``python -m benchmarks.drift 200`` prints, of
-200 records: the logistic regression of the truth on the reported log odds, whose intercept is 0 and
-slope 1; z of sum(truth - probability); and how many constant ones have a probability above 0.95, at
-most 1 in 19. A record takes about 2 CPU s. A second number is the first seed.
+reported probability p of drift a share p must drift. ``python -m benchmarks.drift_evidence 200``
+prints, of 200 records: the logistic regression of the truth on the reported log odds, whose
+intercept is 0 and slope 1; z of sum(truth - probability); and how many constant ones have a
+probability above 0.95, at most 1 in 19. A record takes about 2 CPU s. A second number is the first
+seed.
 
 Seeds 101 to 288: slope 0.95 (0.18), intercept -0.59 (0.22), z -2.7, none of 111 constant ones above
 0.95. In these seeds 77 records drift and 94 were expected, as far off as the intercept is.
