@@ -11,7 +11,7 @@ from arviz_plots.visuals import hline
 
 from ..diagnostics.constancy.table import DriftScan
 from ..errors import ModelError
-from .canvas import add_legend, band, curve, interval, label_axes, time_label
+from .canvas import add_legend, band, curve, interval, label_axes, legend_style, time_label
 from .marks import canvas_over_time, points
 from .results import select_names
 
@@ -104,6 +104,7 @@ def plot_drift(
     legend = {
         "summed scores (sd)": SUM,
         "95 % of constant parameters": {**CONSTANT, "width": 8},
+        "time of the change": legend_style({"color": TURN["color"]}),
     }
     add_legend(collection, legend, len(shown) > 1)
     return collection

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from arviz_plots import PlotCollection
 
-from .canvas import BOUND, band, interval
+from .canvas import BOUND, band, interval, label_ticks
 from .marks import DRAWS
 from .results import SAMPLE_DIMS
 
@@ -37,6 +37,7 @@ def is_continuous(edges: xr.Dataset) -> xr.DataArray:
 def draw_ribbons(collection: PlotCollection, edges: xr.Dataset) -> dict[str, dict[str, Any]]:
     """Draw the ribbons over time; return their legend entry."""
     collection.map(_bands, "probability", data=edges, **STYLE)
+    collection.map(_tick_values, data=edges, ignore_aes="all", store_artist=False)
     return {"probability": {**STYLE, "width": 8}}
 
 
@@ -59,3 +60,10 @@ def _bands(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
     for value in da["value"].values:
         drawn = band(da.sel(value=value, drop=True), target, **kwargs) or drawn
     return drawn
+
+
+def _tick_values(da: xr.DataArray, target: Any) -> None:
+    """Set the ticks of a state with ribbons at its values."""
+    values = da.mean([BOUND, "time"]).dropna("value").values
+    if values.size:
+        label_ticks(da, target, ticks={"values": values, "labels": [f"{v:g}" for v in values]})

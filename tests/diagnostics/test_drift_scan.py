@@ -12,6 +12,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.diagnostics.constancy.axis import TimeAxis
 from pymc_statespace_filters.diagnostics.constancy.simulations import ConstancyTest
 from pymc_statespace_filters.diagnostics.constancy.statistics import constancy, p_values
+from pymc_statespace_filters.diagnostics.constancy.table import sentences
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.pymc_model.term_scores import ScoredVariable
 from tests.systems import DUFFING, driven, driven_by_wandering_gain
@@ -232,3 +233,15 @@ def test_bad_arguments():
     noisy = driven_model(simulated(2), filter=psf.BootstrapPF(100))
     with pytest.raises(ModelError, match=r"must be EKF, UKF or IPLF.*BootstrapPF\(100\)"):
         psf.drift_scan(Point(), noisy)
+
+
+def test_one_that_varies_is_to_be_mended_before_others_are_believed():
+    table = pd.DataFrame(
+        {"p_value": [0.01, 0.02, 0.5], "time": [61, 30, 5], "change": [-243.0, 0.0013, 1.0]},
+        index=["level", "noise", "rate"],
+    )
+    _, first, second, advice = sentences(table, 99)
+    assert first == "level varies: if it is one jump, it falls by about 240 before the row at 61."
+    assert "noise varies: if it is one jump, it rises by about 0.0013" in second
+    assert advice.startswith("Begin with level: ")
+    assert len(sentences(table.iloc[1:], 99)) == 2

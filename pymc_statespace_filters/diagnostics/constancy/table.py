@@ -65,7 +65,7 @@ def scan_table(found: Statistics, labels: list[str], axis: TimeAxis) -> DriftSca
     columns |= {"time": axis.shown[at], "change": _changes(found, at)}
     table = pd.DataFrame(columns, index=pd.Index(labels, name="parameter"))
     table = table.sort_values(["p_alone", "statistic"], ascending=[True, False], kind="stable")
-    text = _sentences(table, len(found.simulated))
+    text = sentences(table, len(found.simulated))
     return DriftScan(table, paths=_paths(found, labels, axis, at), sentences=text)
 
 
@@ -110,17 +110,25 @@ def _paths(
     )
 
 
-def _sentences(table: pd.DataFrame, n_simulated: int) -> list[str]:
+def sentences(table: pd.DataFrame, n_simulated: int) -> list[str]:
     """What the display says below the columns."""
     found = [
         f"p_value is for all {len(table)} parameters together, p_alone for one; from {n_simulated} "
         "simulated data sets with constant parameters, each estimated anew."
     ]
-    for name, row in table[table["p_value"] <= LEVEL].iterrows():
+    varying = table[table["p_value"] <= LEVEL]
+    for name, row in varying.astype(object).iterrows():  # a whole number stays one
         way = "rises" if row["change"] > 0 else "falls"
         where = f" in record {row['record']!r}" if "record" in row else ""
+        size = float(f"{abs(row['change']):.2g}")  # 240, not 2.4e+02
         found.append(
-            f"{name} varies: if it is one jump, it {way} by about {abs(row['change']):.2g} before "
-            f"the row at {row['time']}{where}."
+            f"{name} varies: if it is one jump, it {way} by about {size:g} before the row at "
+            f"{row['time']}{where}."
+        )
+    if len(varying) > 1:
+        found.append(
+            f"Begin with {varying.index[0]}: a large change of one parameter leaves large "
+            "residuals, which make others seem to vary. Let it drift by psf.drifting, and scan "
+            "that model."
         )
     return found
