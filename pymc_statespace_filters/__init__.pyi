@@ -49,12 +49,12 @@ from .plots import (
 )
 from .point_estimation import maximum_likelihood
 from .pymc_model.distribution import StateSpace
+from .rivals import run_models
 from .sampling import (
     DRAM,
     RandomWalkSettings,
     Ranks,
     find_starts,
-    run_models,
     sample,
     sample_dram,
     suggest_particles,

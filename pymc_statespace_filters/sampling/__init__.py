@@ -1,7 +1,7 @@
 """Samplers of a model's log-density and noise seeds, independent of its filters."""
 
 from .chosen_sampler import sample
-from .dram_chains import run_models, sample_dram
+from .dram_chains import sample_dram
 from .particle_number.suggest import suggest_particles
 from .run.ranks import Ranks
 from .starts.find_starts import find_starts
@@ -13,7 +13,6 @@ __all__ = [
     "RandomWalkSettings",
     "Ranks",
     "find_starts",
-    "run_models",
     "sample",
     "sample_dram",
     "suggest_particles",

@@ -1,22 +1,19 @@
-"""`sample_dram` and `run_models`: whole chains in machine code, results as from ``pm.sample``."""
+"""`sample_dram`: whole chains in machine code, results as from ``pm.sample``."""
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
-from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
 from pymc.model import Model
 from xarray import DataTree
 
-from ..errors import ModelError
 from ..former_names import former_names
 from ..pymc_model.inspection import given_model
-from .checkpoint.checkpoint import checked_folder, folder_name
+from .checkpoint.checkpoint import checked_folder
 from .run.driver import sample_models
 from .run.request import RunArguments
-from .run.warm_start import warm_started, warm_started_models
+from .run.warm_start import warm_started
 from .target.settings import FORMER_ARGUMENTS, RandomWalkSettings
 
 
@@ -204,100 +201,3 @@ def sample_dram(
     folders = [] if checkpoint is None else [checked_folder(checkpoint)]
     trees = sample_models({"": model}, [request], options, folders)
     return None if trees is None else trees[""]
-
-
-@overload
-def run_models(
-    models: Mapping[str, Model], *, comm: None = ..., **settings: Any
-) -> dict[str, DataTree]: ...
-
-
-@overload
-def run_models(
-    models: Mapping[str, Model], *, comm: Any, **settings: Any
-) -> dict[str, DataTree] | None: ...
-
-
-@former_names(**FORMER_ARGUMENTS)
-def run_models(
-    models: Mapping[str, Model],
-    *,
-    pilot: DataTree | Mapping[str, DataTree] | None = None,
-    checkpoint: str | os.PathLike | None = None,
-    comm: Any = None,
-    **settings: Any,
-) -> dict[str, DataTree] | None:
-    """Sample several models in one run, each as by `sample_dram`.
-
-    The chains of all models share the threads, and with MPI the ranks: an idle thread takes the
-    next chain, most expensive model first.
-
-    Parameters
-    ----------
-    models : mapping of str to pymc.Model
-    pilot : xarray.DataTree, or mapping of str to xarray.DataTree, optional
-        As in `sample_dram`, of the models with these names. A single one is the pilot of every
-        model that has a free variable in common with it.
-    checkpoint : str or path, optional
-        A folder with a subfolder for each model. If the process ends for any reason, the same call
-        resumes the run.
-    comm
-        As in `sample_dram`.
-    **settings
-        The other arguments of `sample_dram`, for every model: ``draws``, ``tune``, ``until_ess``,
-        ``max_draws``, ``thin``, ``chains``, ``cores``, ``random_seed``, ``initvals``, ``kernel``,
-        ``progressbar``, ``discard_tuned_samples``, ``compute_convergence_checks``. A model's draws
-        are those of `sample_dram` with the same seed and do not depend on the other models; with
-        ``until_ess`` each stops on its own.
-
-    Returns
-    -------
-    dict of str to xarray.DataTree
-        As returned by `sample_dram`; None on ranks that do not get them. After Ctrl-C, those of the
-        models that have draws; a warning names the others.
-
-    Raises
-    ------
-    ModelError, DataMismatchError, ParallelError, CheckpointError
-        As `sample_dram`.
-
-    Warns
-    -----
-    FilterWarning
-        As `sample_dram`.
-
-    Examples
-    --------
-    >>> import pymc as pm
-    >>> import pymc_statespace_filters as psf
-    >>> rivals = {}
-    >>> for name, sd in (("narrow", 1.0), ("wide", 5.0)):
-    ...     with pm.Model() as rivals[name]:
-    ...         mu = pm.Normal("mu", 0, sd)
-    ...         y = pm.Normal("y", mu, 1.0, observed=[1.2, 0.7, 2.9, 1.8])
-    >>> trees = psf.run_models(rivals, draws=200, tune=200, random_seed=1, progressbar=False)
-    >>> {name: tree["posterior"]["mu"].shape for name, tree in trees.items()}
-    {'narrow': (4, 200), 'wide': (4, 200)}
-    """
-    if unknown := settings.keys() - {field.name for field in fields(RunArguments)}:
-        raise TypeError(
-            f"run_models() got an unexpected keyword argument {min(unknown)!r}: its settings are "
-            "those of sample_dram, without model"
-        )
-    if not isinstance(models, Mapping) or not models:
-        raise ModelError(
-            f"models must be a non-empty mapping of names to pymc.Model, got {models!r}"
-        )
-    for name, model in models.items():
-        if not isinstance(name, str) or not name:
-            raise ModelError(f"names of models must be non-empty strings, got {name!r}")
-        if not isinstance(model, Model):
-            raise ModelError(f"models[{name!r}] must be a pymc.Model, got {model!r}")
-    given = RunArguments(**settings)
-    requests = warm_started_models(given.request(), models, pilot)
-    options = given.options(comm)
-    folders = []
-    if checkpoint is not None:
-        folder = checked_folder(checkpoint)
-        folders = [Path(folder, folder_name(name)) for name in models]
-    return sample_models(models, requests, options, folders)

@@ -14,7 +14,7 @@ import pytest
 from pytensor.compile.ops import wrap_py
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.errors import DataMismatchError
+from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.sampling.run import model_task
 from pymc_statespace_filters.sampling.run.model_task import ModelTask
 from pymc_statespace_filters.sampling.run.request import RunArguments, SamplingRequest
@@ -209,3 +209,32 @@ def test_an_error_names_chain_and_model(models):
     assert re.fullmatch(
         r"in chain \d of model 'broken', after \d+ iterations", caught.value.__notes__[-1]
     )
+
+
+def test_particles_of_each_model_as_if_alone(models):
+    """By `sample_smc`, with the evidences where `compare_evidence` finds them."""
+    rivals = {"narrow": normal_model(), "wide": normal_model(5.0)}
+    settings = {"draws": 40, "populations": 3, "progressbar": False}
+    rng = np.random.default_rng(3)
+    trees = psf.run_models(rivals, sampler="smc", random_seed=rng, **settings)
+    for name, model in rivals.items():
+        alone = psf.sample_smc(model=model, random_seed=np.random.default_rng(3), **settings)
+        assert trees[name]["posterior"].to_dataset().equals(alone["posterior"].to_dataset())
+    table = psf.compare_evidence(trees)
+    assert set(table.index) == set(rivals)
+    assert table.loc["wide", "log_evidence"] == trees["wide"].attrs["log_evidence"]
+
+
+def test_what_particles_do_not_take_is_refused():
+    rivals, impossible = {"one": normal_model()}, pm.Model()
+    with pytest.raises(ModelError, match=r"sampler must be one of \('dram', 'smc'\), got 'nuts'"):
+        psf.run_models(rivals, sampler="nuts")
+    with pytest.raises(TypeError, match=r"argument 'tune': .* those of sample_smc"):
+        psf.run_models(rivals, sampler="smc", tune=10)
+    with pytest.raises(ModelError, match="pilot must be None with sampler='smc'"):
+        psf.run_models(rivals, sampler="smc", pilot={})
+    with impossible:
+        pm.Uniform("y", pm.Normal("m"), 100.0, observed=-100.0)
+    with pytest.raises(ModelError, match="likelihood is positive at 0 of") as caught:
+        psf.run_models({"impossible": impossible}, sampler="smc", draws=10)
+    assert caught.value.__notes__ == ["in model 'impossible'"]

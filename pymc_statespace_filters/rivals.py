@@ -1,0 +1,154 @@
+"""`run_models`: the posteriors of several models in one call, by chains or by particles."""
+
+from collections.abc import Mapping
+from copy import deepcopy
+from dataclasses import fields
+from inspect import signature
+from pathlib import Path
+from typing import Any, Literal, overload
+
+import numpy as np
+from pymc.model import Model
+from xarray import DataTree
+
+from .errors import ModelError
+from .former_names import former_names
+from .parameter_particles import sample_smc
+from .sampling.checkpoint.checkpoint import checked_folder, folder_name
+from .sampling.run.driver import sample_models
+from .sampling.run.request import RunArguments
+from .sampling.run.warm_start import warm_started_models
+from .sampling.target.settings import FORMER_ARGUMENTS
+
+_SAMPLERS = {
+    "dram": ("sample_dram", {field.name for field in fields(RunArguments)}),
+    "smc": ("sample_smc", signature(sample_smc).parameters.keys() - {"model"}),
+}
+
+
+@overload
+def run_models(
+    models: Mapping[str, Model], *, comm: None = ..., **settings: Any
+) -> dict[str, DataTree]: ...
+
+
+@overload
+def run_models(
+    models: Mapping[str, Model], *, comm: Any, **settings: Any
+) -> dict[str, DataTree] | None: ...
+
+
+@former_names(**FORMER_ARGUMENTS)
+def run_models(
+    models: Mapping[str, Model],
+    *,
+    sampler: Literal["dram", "smc"] = "dram",
+    pilot: DataTree | Mapping[str, DataTree] | None = None,
+    checkpoint: Any = None,
+    comm: Any = None,
+    **settings: Any,
+) -> dict[str, DataTree] | None:
+    """Sample several models in one run, each as by `sample_dram` or `sample_smc`.
+
+    The chains of all models share the threads, and with MPI the ranks: an idle thread takes the
+    next chain, most expensive model first. Runs of `sample_smc`, each of which uses all threads,
+    follow one another, and store the evidences for `compare_evidence`.
+
+    Parameters
+    ----------
+    models : mapping of str to pymc.Model
+    sampler : {"dram", "smc"}
+        `sample_dram` or `sample_smc`.
+    pilot : xarray.DataTree, or mapping of str to xarray.DataTree, optional
+        As in `sample_dram`, of the models with these names. A single one is the pilot of every
+        model that has a free variable in common with it. Only with "dram".
+    checkpoint : str or path, optional
+        A folder with a subfolder for each model. If the process ends for any reason, the same call
+        resumes the run.
+    comm
+        As in `sample_dram`.
+    **settings
+        The other arguments of the sampler, for every model; of `sample_dram` ``draws``, ``tune``,
+        ``until_ess``, ``max_draws``, ``thin``, ``chains``, ``cores``, ``random_seed``,
+        ``initvals``, ``kernel``, ``progressbar``, ``discard_tuned_samples``,
+        ``compute_convergence_checks``. A model's draws are those of the sampler with the same seed
+        and do not depend on the other models; with ``until_ess`` each stops on its own.
+
+    Returns
+    -------
+    dict of str to xarray.DataTree
+        As returned by the sampler; None on ranks that do not get them. After Ctrl-C in "dram",
+        those of the models that have draws; a warning names the others.
+
+    Raises
+    ------
+    ModelError, DataMismatchError, ParallelError, CheckpointError
+        As the sampler.
+
+    Warns
+    -----
+    FilterWarning, EvidenceWarning
+        As the sampler.
+
+    Examples
+    --------
+    >>> import pymc as pm
+    >>> import pymc_statespace_filters as psf
+    >>> rivals = {}
+    >>> for name, sd in (("narrow", 1.0), ("wide", 5.0)):
+    ...     with pm.Model() as rivals[name]:
+    ...         mu = pm.Normal("mu", 0, sd)
+    ...         y = pm.Normal("y", mu, 1.0, observed=[1.2, 0.7, 2.9, 1.8])
+    >>> trees = psf.run_models(rivals, draws=200, tune=200, random_seed=1, progressbar=False)
+    >>> {name: tree["posterior"]["mu"].shape for name, tree in trees.items()}
+    {'narrow': (4, 200), 'wide': (4, 200)}
+    """
+    _check_models(models)
+    if sampler not in _SAMPLERS:
+        raise ModelError(f"sampler must be one of {tuple(_SAMPLERS)}, got {sampler!r}")
+    name, known = _SAMPLERS[sampler]
+    if unknown := settings.keys() - known:
+        raise TypeError(
+            f"run_models() got an unexpected keyword argument {min(unknown)!r}: its settings are "
+            f"those of {name}, without model"
+        )
+    folders = []
+    if checkpoint is not None:
+        folder = checked_folder(checkpoint)
+        folders = [Path(folder, folder_name(name)) for name in models]
+    if sampler == "smc":
+        if pilot is not None:
+            raise ModelError("pilot must be None with sampler='smc', which starts from the prior")
+        if checkpoint is not None or comm is not None:
+            raise ModelError("checkpoint and comm must be None with sampler='smc'")
+        return _particles(models, settings)
+    given = RunArguments(**settings)
+    requests = warm_started_models(given.request(), models, pilot)
+    return sample_models(models, requests, given.options(comm), folders)
+
+
+def _check_models(models: Mapping[str, Model]) -> None:
+    """Raise unless these are models with names."""
+    if not isinstance(models, Mapping) or not models:
+        raise ModelError(
+            f"models must be a non-empty mapping of names to pymc.Model, got {models!r}"
+        )
+    for name, model in models.items():
+        if not isinstance(name, str) or not name:
+            raise ModelError(f"names of models must be non-empty strings, got {name!r}")
+        if not isinstance(model, Model):
+            raise ModelError(f"models[{name!r}] must be a pymc.Model, got {model!r}")
+
+
+def _particles(models: Mapping[str, Model], settings: Mapping[str, Any]) -> dict[str, DataTree]:
+    """Every model by `sample_smc`, with the same seed."""
+    seed, found = settings.get("random_seed"), {}
+    for name, model in models.items():
+        # Each gets the numbers that a generator would give the first.
+        own = deepcopy(seed) if isinstance(seed, np.random.Generator) else seed
+        try:
+            found[name] = sample_smc(model=model, **{**settings, "random_seed": own})
+        except Exception as error:
+            error.add_note(f"in model {name!r}")
+            raise
+    return found
