@@ -33,6 +33,7 @@ GROUPS = {
         "mechanics.hysteresis",
         "mechanics.hysteresis_branch",
         "mechanics.linear_modes",
+        "mechanics.polynomial_terms",
     ),
     "Parts of Markov chains": ("stationary",),
     "Parts of compartment models": (

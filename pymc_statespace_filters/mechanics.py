@@ -3,6 +3,7 @@
 from .evaluation.linear_modes import linear_modes
 from .system.forces import cubic, freeplay, hysteresis, hysteresis_branch
 from .system.second_order import second_order
+from .system.term_library import polynomial_terms
 
 __all__ = [
     "cubic",
@@ -10,5 +11,6 @@ __all__ = [
     "hysteresis",
     "hysteresis_branch",
     "linear_modes",
+    "polynomial_terms",
     "second_order",
 ]
