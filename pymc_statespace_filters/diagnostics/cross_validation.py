@@ -14,7 +14,7 @@ from scipy.special import logsumexp
 
 from ..errors import EvidenceWarning, ModelError
 from ..importance import largest_good_k, smoothed
-from ..pymc_model.inspection import given_model
+from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.state_graphs import StateSpaceVariable
 from ..states.draws import select_draws
 from ..states.variable import select_variables
@@ -126,7 +126,7 @@ def leave_future_out(
     >>> score.elpd_i.sizes["d_time"], bool(score.pareto_k.max() < 0.7)
     (20, True)
     """
-    model = given_model(model)
+    model = model_of_draws(model, idata)
     variable = _one_variable(model, var_name)
     time, name = variable.dims[0], variable.name
     observed = np.flatnonzero(~np.isnan(observed_values(model, name)).all(axis=1))

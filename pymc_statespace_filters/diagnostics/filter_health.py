@@ -12,7 +12,7 @@ from ..filter_checks.checks import stored
 from ..filter_checks.finding import OFF
 from ..filters.outcomes import COLLAPSED
 from ..filters.protocol import HealthFilter
-from ..pymc_model.inspection import given_model
+from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.state_graphs import StateSpaceVariable
 from ..states.draws import select_draws
 from ..states.groups import add_group, by_record, coords_of_steps, join_rows
@@ -151,7 +151,7 @@ def filter_diagnostics(
     >>> dict(found["d_pit"].sizes), bool(found["d_uniformity"].item() > 0.01)
     ({'d_time': 40, 'observable': 1}, True)
     """
-    model = given_model(model)
+    model = model_of_draws(model, idata)
     rng = check_random_seed(random_seed)
     draws = select_draws(idata, n_draws)
     parts = []

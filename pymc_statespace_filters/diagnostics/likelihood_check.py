@@ -9,7 +9,7 @@ import xarray as xr
 
 from ..filter_checks.checks import check_model, outcomes_of, store
 from ..filters.protocol import check_filter as check_is_filter
-from ..pymc_model.inspection import given_model
+from ..pymc_model.other_filter import model_of_draws
 from ..system.checks import check_count, check_flag, check_random_seed
 from ..tables import SentenceTable
 
@@ -156,7 +156,7 @@ def check_filter(
     >>> "GridFilter" in table["verdict"][0]
     True
     """
-    model = given_model(model)
+    model = model_of_draws(model, idata)
     if filter is not None:
         check_is_filter(filter)
     table = check_model(

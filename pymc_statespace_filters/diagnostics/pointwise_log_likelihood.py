@@ -8,7 +8,7 @@ import pymc as pm
 import xarray as xr
 
 from ..errors import EvidenceWarning, ModelError
-from ..pymc_model.inspection import given_model
+from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.state_graphs import StateSpaceVariable, terms_of
 from ..states.draws import PosteriorDraws, select_draws
 from ..states.groups import add_group, coords_of_steps
@@ -104,7 +104,7 @@ def compute_log_likelihood(
     >>> dict(terms.sizes)
     {'chain': 2, 'draw': 100, 'd_record': 2}
     """
-    model = given_model(model)
+    model = model_of_draws(model, idata)
     draws, variables = select_draws(idata, None), select_variables(model, var_name)
     _warn_of_sequence([one.name for one in variables if not one.is_panel])
     found = xr.merge(

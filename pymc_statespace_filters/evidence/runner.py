@@ -18,7 +18,8 @@ from ..filter_checks.finding import OFF
 from ..filters.protocol import Filter
 from ..progress import row_progress
 from ..pymc_model.density import ModelDensity
-from ..pymc_model.inspection import exactness, given_model
+from ..pymc_model.inspection import exactness
+from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.posterior_draws import noise_was_moved, posterior_group
 from ..pymc_model.prior import Support
 from ..unvisited.sentences import stored, unvisited
@@ -64,7 +65,7 @@ def run_estimators(
         chains that disagree, once for each unreliable estimate, and once for each estimator that
         cannot treat the model while another can.
     """
-    model = given_model(model)
+    model = model_of_draws(model, idata)
     posterior_group(idata)  # fails early, before anything is compiled
     exact = None if filter is None else ExactDensity(model, filter)
     density = ModelDensity(model, moved=noise_was_moved(idata))

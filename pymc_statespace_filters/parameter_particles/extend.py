@@ -111,8 +111,7 @@ def extend(
     4
     """
     check_flag("progressbar", progressbar)
-    rows = ObservedRows.of(given_model(model))
-    progress, request = restored(idata, rows)
+    progress, request = restored(idata, given_model(model))
     rows = progress.rows
     if times is None and steps is None:
         times = times_of_data(observed)

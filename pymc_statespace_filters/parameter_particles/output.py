@@ -20,6 +20,7 @@ from ..filters.protocol import Filter
 from ..importance import normalised
 from ..pymc_model.held_seed import INSIDE
 from ..pymc_model.inspection import exactness, filters_used, noise_seeds
+from ..pymc_model.other_filter import BY_PARTICLES
 from ..pymc_model.prior import Support
 from ..sampling.output.datatree import to_datatree
 from ..sampling.output.deterministics import Deterministics
@@ -72,7 +73,7 @@ def as_datatree(
     chains = _chains(model, particles.at(index), index // request.size.n_particles, request)
     tree = to_datatree(
         model, raveled, chains, tune=0, keep_warmup=False, sampling_time=seconds,
-        attrs={"sampler": ESTIMATOR},
+        attrs={"sampler": BY_PARTICLES},
     )  # fmt: skip
     merged, error = map(float, merged_log_evidence(run.log_evidences))
     tree[COURSE] = xr.DataTree(run.course.assign(log_evidence=("population", run.log_evidences)))
@@ -80,7 +81,7 @@ def as_datatree(
     tree.attrs |= {
         **filters_used(model),
         "exact": int(exactness(model)),
-        "sampler": ESTIMATOR,
+        "sampler": BY_PARTICLES,
         "data": data,
         "log_evidence": merged,
         "log_evidence_se": error,

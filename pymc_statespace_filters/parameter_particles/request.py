@@ -26,6 +26,7 @@ class Request(NamedTuple):
     size: Size
     n_populations: int
     entropy: tuple[int, ...]
+    inner: str = ""  # the filter in place of the model's
 
     @property
     def n_particles(self) -> int:

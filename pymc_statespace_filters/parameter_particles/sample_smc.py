@@ -11,8 +11,11 @@ from ..compiler.native.compilation import COMPILATION
 from ..errors import ModelError
 from ..evidence.estimators.maximum_likelihood import max_log_likelihood
 from ..evidence.posterior import Posterior, observed_in
+from ..filters.protocol import Filter
+from ..filters.recommendation import short_form
 from ..progress import stage_progress
 from ..pymc_model.inspection import given_model
+from ..pymc_model.other_filter import model_with
 from ..pymc_model.prior import ModelFactors
 from ..system.checks import check_flag, check_random_seed
 from .filter_doubts import checked_at_end, not_checked
@@ -32,6 +35,7 @@ def sample_smc(
     model: pm.Model | None = None,
     data: Literal["tempered", "sequential"] = "tempered",
     populations: int = 10,
+    inner: Filter | None = None,
     waste_free: bool = True,
     random_seed: int | np.random.Generator | None = None,
     progressbar: bool = True,
@@ -59,6 +63,10 @@ def sample_smc(
     populations : int
         Populations, at least 2, whose spread gives the errors. One more, the pilot, chooses
         temperatures and steps, and is not part of the result.
+    inner : filter, optional
+        For the likelihood of every particle, in place of the filters of the model: as ``EnKF(200)``
+        or ``BootstrapPF(100)`` for a model with `EKF`. The results of this run bring it along, so
+        that `extend`, `reweight`, `estimate_evidence` and states take the same ``model``.
     waste_free : bool
         Whether all states of few long chains are the particles after a move (Dau and Chopin), or
         the last states of as many short chains as there are particles.
@@ -122,7 +130,8 @@ def sample_smc(
 
     A noisy likelihood is estimated when a point is proposed, and the estimate stays with its point:
     with an unbiased filter the posterior and the evidence are exact for any number of its members.
-    `EnKF` and `PFEnKF` have a bias, which the results carry (``attrs["exact"]`` is 0). After moves
+    `EnKF` and `PFEnKF` have a bias, which the results carry (``attrs["exact"]`` is 0), and which
+    `reweight` corrects, if its weights are good. After moves
     of a sequential run the variance of the log-likelihood at fixed parameters is measured; above 2
     the members are doubled, the ratio of new to old estimates being a factor of the weights.
     ``attrs["filter"]`` is the filter at the end. A sequential run with a noisy filter has no
@@ -148,11 +157,14 @@ def sample_smc(
     True
     """
     model = given_model(model)
+    if inner is not None:
+        model = model_with(model, "inner", inner)
     if not (isinstance(data, str) and data in ("tempered", "sequential")):
         raise ModelError(f"data must be 'tempered' or 'sequential', got {data!r}")
     rng = check_random_seed(random_seed)
     entropy = tuple(rng.integers(2**63, size=2).tolist())
     request = checked_request(model, draws, populations, waste_free, entropy)
+    request = request._replace(inner="" if inner is None else short_form(inner))
     check_flag("progressbar", progressbar)
     doubts_of: DoubtsOf = not_checked
     if check_flag("compute_convergence_checks", compute_convergence_checks):

@@ -11,12 +11,15 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
+import pymc as pm
 import xarray as xr
 from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.traversal import graph_inputs
 
 from ..errors import DataMismatchError, ModelError
+from ..filters.written import filter_from
 from ..pymc_model.filter_rows import Record
+from ..pymc_model.other_filter import model_with
 from ..smc.bridge import Cloud
 from ..smc.moves import Size
 from ..smc.particles import Particles, Populations
@@ -57,12 +60,13 @@ def stored(progress: Progress, request: Request) -> xr.Dataset | None:
         "populations": request.n_populations,
         "scale": progress.cloud.scale,
         "n_members": n_members(progress.rows),
+        "inner": request.inner,
     }
     return xr.Dataset(found, attrs=attrs)
 
 
-def restored(idata: xr.DataTree, rows: ObservedRows) -> tuple[Progress, Request]:
-    """The run of a result, with the record that it has seen.
+def restored(idata: xr.DataTree, model: pm.Model) -> tuple[Progress, Request]:
+    """The run of a result of a model, with the record that it has seen.
 
     Raises
     ------
@@ -78,6 +82,8 @@ def restored(idata: xr.DataTree, rows: ObservedRows) -> tuple[Progress, Request]
         )
     state = idata[GROUP].to_dataset()
     attrs = state.attrs
+    inner = filter_from(str(attrs["inner"]))
+    rows = ObservedRows.of(model if inner is None else model_with(model, "inner", inner))
     if _identity(rows) != attrs["model"]:
         raise DataMismatchError(
             "model must be that of idata: its priors, parameters, system, filter or values of "
@@ -85,7 +91,7 @@ def restored(idata: xr.DataTree, rows: ObservedRows) -> tuple[Progress, Request]
         )
     draws, populations = int(attrs["draws"]), int(attrs["populations"])
     size = Size.of(draws, bool(attrs["waste_free"]))
-    request = Request(draws, size, populations, tuple(json.loads(attrs["entropy"])))
+    request = Request(draws, size, populations, tuple(json.loads(attrs["entropy"])), attrs["inner"])
     if attrs["n_members"] != n_members(rows):
         rows = rows.of_size(int(attrs["n_members"]))
     pilot, others = (_populations(state, prefix) for prefix in _POPULATIONS)

@@ -8,7 +8,6 @@ import pymc as pm
 import pytensor
 import pytensor.tensor as pt
 from pymc.distributions.distribution import Continuous
-from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
@@ -25,7 +24,7 @@ from ..system.parameters import check_names, symbolic_panel_parameters, symbolic
 from ..system.record import check_seed, symbolic_record
 from ..system.timed_inputs import TimedInputs
 from . import dispatch as dispatch  # registers draw and density
-from .random_variable import NUMBERS, PanelRV, StateSpaceRV
+from .random_variable import NUMBERS, PanelRV, StateSpaceRV, make_seed
 
 
 class StateSpace(Continuous):
@@ -181,7 +180,10 @@ class StateSpace(Continuous):
         _add_coord(model, component_dim, list(system.observables), name)
         if panel is not None:
             _add_records(model, full_name, row_dim, record)
-        noise_seed = _add_seed(model, full_name, seed_array) if filter.noisy else seed_array
+        noise_seed: Any = seed_array
+        if filter.noisy:
+            noise_seed = make_seed(full_name, seed_array)
+            model.register_data_var(noise_seed)
         return super().__new__(
             cls,
             name,
@@ -301,13 +303,6 @@ def _add_records(model: pm.Model, name: str, row_dim: str, panel: SymbolicPanel)
     for what, values in (("panel", of_rows), ("time", np.concatenate(times))):
         shared = pytensor.shared(values, name=f"{name}_{what}")
         model.register_data_var(shared, dims=(row_dim,))
-
-
-def _add_seed(model: pm.Model, name: str, seed: np.ndarray) -> SharedVariable:
-    # As pm.Data does, which would truncate the seed to 32 bits.
-    shared = pytensor.shared(seed, name=f"{name}_seed")
-    model.register_data_var(shared)
-    return shared
 
 
 def _add_coord(model: pm.Model, dim: str, values: Any, name: str) -> None:

@@ -5,10 +5,13 @@ imports no simulator, so that a module can test for the operation's type at litt
 """
 
 from collections.abc import Sequence
+from copy import copy
 from functools import singledispatch
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
+import pytensor
+from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.tensor.random.op import RandomVariable
 
 from ..filters.protocol import Filter
@@ -53,6 +56,12 @@ class StateSpaceRV(RandomVariable):
     def __str__(self) -> str:
         return f"StateSpaceRV{{{self.filter}}}"
 
+    def with_filter(self, filter: Filter) -> Self:
+        """The same operation with another filter."""
+        other = copy(self)
+        other.filter = filter
+        return other
+
     def _supp_shape_from_params(self, dist_params: Sequence, param_shapes: Any = None) -> list:
         # Steps (J,), or the rows (J, 3) of a panel: the other dimensions before are of a batch.
         steps = dist_params[1].shape if param_shapes is None else param_shapes[1]
@@ -76,3 +85,11 @@ class PanelRV(StateSpaceRV):
 def draw_in_python(op: RandomVariable, rng: np.random.Generator, *arguments: Any) -> np.ndarray:
     """Draw data with a NumPy generator; arguments are the parameters and the batch shape."""
     raise NotImplementedError(f"no draw is registered for {op}")
+
+
+def make_seed(name: str, seed: np.ndarray) -> SharedVariable:
+    """The noise seed of a variable, as shared data of its model.
+
+    As pm.Data makes it, which would truncate the seed to 32 bits.
+    """
+    return pytensor.shared(seed, name=f"{name}_seed")

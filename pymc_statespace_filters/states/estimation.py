@@ -6,7 +6,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from ..pymc_model.inspection import given_model
+from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.state_graphs import observed_variables, smoothing_method
 from ..system.checks import check_random_seed
 from ..system.own_units import in_own_units, moments_in_own_units
@@ -172,7 +172,7 @@ def _add_states(
     extend_inferencedata: bool,
     progressbar: bool,
 ) -> xr.DataTree:
-    model = given_model(model)
+    model = model_of_draws(model, idata)
     check_at(at)
     rng = check_random_seed(random_seed)
     draws = select_draws(idata, n_draws)

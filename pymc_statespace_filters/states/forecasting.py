@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..compiler.native.python_call import call_machine_code
 from ..errors import ModelError
 from ..evaluation.simulate import continuation
-from ..pymc_model.inspection import given_model
+from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.state_graphs import observed_variables
 from ..system.checks import check_random_seed, is_integer
 from ..system.given_record import inputs_with_times
@@ -105,7 +105,7 @@ def forecast(
     >>> idata["predictions"]["d"].sizes, idata["predictions"]["d_time"].values
     (Frozen({'chain': 2, 'draw': 200, 'd_time': 3, 'observable': 1}), array([5., 6., 7.]))
     """
-    model = given_model(model)
+    model = model_of_draws(model, idata)
     rng = check_random_seed(random_seed)
     draws = select_draws(idata, n_draws)
     dims = state_dims(observed_variables(model))

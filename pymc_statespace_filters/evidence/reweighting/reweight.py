@@ -18,7 +18,7 @@ from ...importance import MIN_EFFECTIVE, largest_good_k, pareto_k
 from ...parallel.cpu_affinity import cores_set_to
 from ...progress import row_progress
 from ...pymc_model.density import ModelDensity
-from ...pymc_model.inspection import given_model
+from ...pymc_model.other_filter import model_of_draws
 from ...pymc_model.posterior_draws import MIN_DRAWS, noise_was_moved, posterior_group
 from ...system.checks import check_count, check_random_seed, is_integer
 from ..exact_density import ExactDensity
@@ -157,7 +157,7 @@ def reweight(
     >>> bool(exact.attrs["pareto_k"] < 0.7), bool(exact.attrs["log_weight_sd"] < 1)
     (True, True)
     """
-    model = given_model(model)
+    model = model_of_draws(model, idata)
     rng = check_random_seed(random_seed)
     with cores_set_to(None if cores is None else check_count("cores", cores, 1)), COMPILATION:
         rows = _rows(idata, n_draws)
