@@ -89,6 +89,7 @@ GROUPS = {
     "Evidence and model choice": (
         "estimate_evidence",
         "compare_evidence",
+        "compare_prequential",
         "average_models",
         "prior_sensitivity",
         "drift_evidence",

@@ -32,7 +32,7 @@ from .filters import (
     GuidedPF,
     PFEnKF,
 )
-from .parameter_particles import extend, sample_smc
+from .parameter_particles import compare_prequential, extend, sample_smc
 from .plots import (
     plot_average,
     plot_drift,
@@ -106,6 +106,7 @@ __all__ = [
     "check_filter",
     "chib_jeliazkov",
     "compare_evidence",
+    "compare_prequential",
     "compartments",
     "compute_log_likelihood",
     "drift_evidence",

@@ -13,20 +13,6 @@ MAX_LAGS, OBSERVATIONS_PER_LAG = 10, 5  # of the whiteness test
 MAX_LAG, PER_LAG = 25, 4  # of the correlations that are returned
 
 
-def pit_of(observed: Array, predicted: Array, rng: np.random.Generator) -> Array:
-    """Randomised probability integral transform of observations (...) given draws (S, ...).
-
-    The rank of the observation among itself and the draws, randomised over ties and within the
-    rank: uniform if the observation follows the distribution of the draws, for counts too (Czado,
-    Gneiting and Held 2009). NaN where the observation is missing; NaN draws are ignored.
-    """
-    n_draws = np.isfinite(predicted).sum(axis=0)
-    below = (predicted < observed).sum(axis=0)
-    ties = (predicted == observed).sum(axis=0)
-    pit = (below + rng.uniform(size=observed.shape) * (ties + 1)) / (n_draws + 1)
-    return np.where(np.isnan(observed) | (n_draws == 0), np.nan, pit)
-
-
 def residual_limit(n_draws: Any) -> Any:
     """The largest residual that so many draws of a prediction can tell."""
     return norm.isf(0.5 / n_draws)

@@ -7,6 +7,7 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from scipy.special import log_ndtr, logsumexp, ndtri_exp
 
+from ..pit import pit_of
 from ..pymc_model.state_graphs import (
     StateSpaceVariable,
     exact_predictions,
@@ -14,7 +15,7 @@ from ..pymc_model.state_graphs import (
     observations_given,
 )
 from ..states.record import Array, Graphs, RecordAtDraws, States
-from .calibration import pit_of, residual_limit
+from .calibration import residual_limit
 
 # Fewer draws than this behind the probability of a tail, and one of them decides it.
 _LEAST_DRAWS = 3.0

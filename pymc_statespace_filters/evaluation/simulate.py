@@ -130,8 +130,10 @@ def _continuation(observe: Any) -> Callable:
 
 def _observations(observe: Any) -> Callable:
     def run(rng, functions, dt, theta, states, steps, inputs, t0):
-        c, observations = _constants(functions, theta), np.empty((steps.size, functions.p))
+        c, observations = _constants(functions, theta[0]), np.empty((steps.size, functions.p))
         for i in range(steps.size):
+            if i > 0 and len(theta) > 1:
+                c = _constants(functions, theta[i])
             x, k = states[i].copy().reshape(-1, 1), steps[i]
             observe(rng, functions, c, inputs, k, t0 + k * dt, x, observations[i])
         return observations
@@ -205,7 +207,7 @@ def continuation(system: StateSpaceModel) -> Simulator:
 def observer(system: StateSpaceModel) -> Simulator:
     """The function (rng, theta, states, steps, inputs, t0) -> an observation (R, p) of each state.
 
-    ``states`` (R, n) are those at ``steps`` (R,).
+    ``states`` (R, n) are those at ``steps`` (R,), and theta (R, k) or (1, k) those of all.
     """
     return _simulator(system, _observations)
 

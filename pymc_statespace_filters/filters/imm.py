@@ -3,6 +3,8 @@
 from dataclasses import KW_ONLY, dataclass, field
 from typing import NoReturn
 
+import numpy as np
+
 from ..compiler.lowering.compiled_system import compile_system
 from ..compiler.native.planned_function import PlannedFunction
 from .ekf import EKF
@@ -15,6 +17,7 @@ from .regimes.hybrid import hybrid_of
 from .regimes.mixture import mixture_functions
 from .regimes.mixture_states import states_plan
 from .signatures import STATES
+from .state_law import StateLaw, law_of_regimes
 from .ukf import UKF
 
 
@@ -105,6 +108,11 @@ class IMM(GaussianFilterBase):
         hybrid = hybrid_of(system.model)
         plan = states_plan(system, hybrid, self._functions(system), moment)
         return PlannedFunction(plan, *STATES)
+
+    def law_of_state(self, system: System, states: np.ndarray) -> StateLaw:
+        """Return the law of the state, from what the filter leaves (m, S) at m points."""
+        hybrid = hybrid_of(system.model)
+        return law_of_regimes(states, hybrid.regimes, hybrid.order)
 
     def smoothing_method(self, system: System) -> NoReturn:
         """Raise: the filter has no smoother."""

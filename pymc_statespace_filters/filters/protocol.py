@@ -3,8 +3,8 @@
 A filter is an immutable, hashable object that holds settings. It states which systems it supports
 and compiles functions for one system, which it is given as a `System`. No base class is needed:
 `log_likelihood`, `StateSpace`, `sample_dram` and the evidence take any `Filter`. Its other
-abilities are the methods of `RunFilter`, `StatesFilter`, `BatchFilter`, `DifferentiableFilter`,
-`EnsembleFilter` and `ToleranceFilter`.
+abilities are the methods of `RunFilter`, `ResumableFilter`, `StatesFilter`, `BatchFilter`,
+`DifferentiableFilter`, `EnsembleFilter` and `ToleranceFilter`.
 
 Arguments and results of the compiled functions are those of `filters.signatures`. Their arrays:
 ``theta`` (k,) parameters; ``steps`` (J,) int64, the step of each observation; ``observed`` (J, p),
@@ -17,10 +17,14 @@ failing observation or -1.
 
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..compiler.codegen.function_types import CompiledFunction
 from ..compiler.native.plan import Plan
 from ..compiler.native.planned_function import PlannedFunction
 from ..errors import ModelError
+from .state_law import StateLaw
 
 if TYPE_CHECKING:
     from ..compiler.lowering.compiled_system import CompiledSystem
@@ -59,6 +63,14 @@ class RunFilter(Filter, Protocol):
 
     def compile_run(self, system: System) -> Compiled:
         """Compile one run with all that it computes."""
+
+
+@runtime_checkable
+class ResumableFilter(RunFilter, Protocol):
+    """A filter that goes on from a vector, its state after earlier rows."""
+
+    def law_of_state(self, system: System, states: NDArray[np.float64]) -> StateLaw:
+        """Return the law of the system's state at m points, from vectors (m, S)."""
 
 
 @runtime_checkable

@@ -46,6 +46,7 @@ from .regimes.hybrid import hybrid_of
 from .regimes.particle_states import RUN_OF_MIXTURE, STATES_OF_MIXTURE, SUMMARISE_MIXTURE
 from .regimes.particles import HybridParticles, hybrid_particles
 from .signatures import RUN, STATES
+from .state_law import StateLaw, weighted_columns
 from .ukf import UKF
 
 
@@ -254,6 +255,12 @@ class RBPF(ParticleFilter):
     def _observed(self, system: System, run: EntryPoint, moment: str) -> Plan:
         last_event = LAST_EVENTS[moment]
         return self.observed(system, run, observer=SUMMARISE_MIXTURE, last_event=last_event)
+
+    def law_of_state(self, system: System, states: np.ndarray) -> StateLaw:
+        """Return the law of the state, from what the filter leaves (m, S) at m points."""
+        particles = self._particles(system)
+        n_finite, order = particles.hybrid.regimes.shape[1], particles.hybrid.order
+        return weighted_columns(states, particles.system.n, n_finite, order)
 
     def smoothing_method(self, system: System) -> NoReturn:
         """Raise: the filter has no smoother."""

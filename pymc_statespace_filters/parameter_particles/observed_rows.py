@@ -90,14 +90,21 @@ class ObservedRows:
         self, x: Array, seeds: NDArray[np.int64], states: Array, begin: int, end: int
     ) -> tuple[Array, Array]:
         """Terms (m, rows) of some rows at points, 0 where they do not count, and new states."""
-        one = seeds[:, 0] if seeds.shape[1] else np.zeros(len(x), np.int64)
         rows = self.record.rows(begin, end)
-        terms, after = self._run(self.parameters(x), one, states, rows)
+        terms, after = self._run(self.parameters(x), _one(seeds), states, rows)
         terms = np.where(np.isnan(terms), -np.inf, terms)
         n_unscored = max(0, self.variable.score_from - begin)
         failed = np.isneginf(terms[:, :n_unscored]).any(axis=1)
         terms[:, :n_unscored] = np.where(failed, -np.inf, 0.0)[:, np.newaxis]
         return terms, after
+
+    def drawn_before(self, particles: Particles, row: int, rng: np.random.Generator) -> Array:
+        """A state (m, n) at a row, drawn given the rows before it; NaN where that has failed."""
+        unseen = np.full_like(self.record.observed, np.nan)
+        rows = self.record._replace(observed=unseen).rows(row, row + 1)
+        theta, seeds = self.parameters(particles.x), _one(particles.seeds)
+        _, after = self._run(theta, seeds, particles.states, rows)
+        return self._run.law_of_state(after).drawn(rng)
 
     def drawn(self, count: int, rng: np.random.Generator) -> Particles:
         """Draws of the prior, before any row."""
@@ -133,6 +140,11 @@ class ObservedRows:
         seeds = self.seeds(len(x), rng)
         terms, states = self.filtered(x, seeds, np.empty((len(x), 0)), 0, n_rows)
         return terms.sum(axis=1), seeds, states
+
+
+def _one(seeds: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The seed of each run; 0 of a filter without noise."""
+    return seeds[:, 0] if seeds.shape[1] else np.zeros(len(seeds), np.int64)
 
 
 def exchanged(

@@ -90,10 +90,11 @@ def sample_smc(
         run: of "tempered" for each ``stage`` the ``temperature``, ``effective_size`` (population,
         stage), ``acceptance``, number ``n_steps`` and relative length ``scale`` of the moves; of
         "sequential" for each ``row`` the ``score``, log p(d_j | d_1 .. d_{j-1}) with the parameters
-        integrated out, ``score_se``, ``effective_size``, the particles ``n_alive`` of
-        positive likelihood before moves (population, row), the number ``n_stages`` of moves,
-        ``acceptance``, ``n_members`` of the filter, ``variance`` of the log-likelihood where it was
-        measured, and ``n_updates`` of filters. ``evidence`` holds the evidence, as
+        integrated out, ``score_se``, ``score_deviation`` (population, row),
+        ``pit`` (row, observable), ``effective_size``, the particles ``n_alive`` of positive
+        likelihood before moves (population, row), the number ``n_stages`` of moves, ``acceptance``,
+        ``n_members`` of the filter, ``variance`` of the log-likelihood where it was measured, and
+        the cost, ``n_updates`` of filters. ``evidence`` holds the evidence, as
         `estimate_evidence` stores it, with the estimator "smc"; the attributes ``log_evidence`` and
         ``log_evidence_se`` repeat it, and ``filter_check``, a JSON text, has the outcome of the
         comparison of filters. ``smc_state``, of "sequential", is what `extend` goes on
@@ -118,6 +119,7 @@ def sample_smc(
     See Also
     --------
     extend : More rows for a sequential run.
+    compare_prequential : Rival models row by row.
     sample : Chains, which take fewer evaluations for one posterior.
     estimate_evidence : The evidence from draws of any sampler.
     plot_prequential : Which rows speak for which model.
@@ -134,8 +136,17 @@ def sample_smc(
     `reweight` corrects, if its weights are good. After moves
     of a sequential run the variance of the log-likelihood at fixed parameters is measured; above 2
     the members are doubled, the ratio of new to old estimates being a factor of the weights.
-    ``attrs["filter"]`` is the filter at the end. A sequential run with a noisy filter has no
-    ``max_log_likelihood``, NaN.
+    ``attrs["filter"]`` is the filter at the end.
+
+    The errors of scores of different rows are correlated. Their covariance is the sum of
+    ``score_deviation`` of one row times that of the other over the populations, so that the squared
+    error of a sum of scores is the sum over populations of the squared sum of deviations. ``pit``
+    is the probability integral transform of an observable: the rank of the value in 1000 draws (or
+    as many as there are particles) of its prediction from the rows before, parameters and filter
+    included, randomised where values are equal. Transforms are uniform and independent from row to
+    row if the data are from model and prior; NaN where nothing was observed.
+
+    A sequential run with a noisy filter has no ``max_log_likelihood``, NaN.
 
     References
     ----------

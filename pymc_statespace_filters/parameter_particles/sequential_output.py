@@ -44,7 +44,9 @@ def finished(
     coords = {dims[0]: rows.shown_times, dims[1]: list(rows.variable.system.observables)}
     array = xr.DataArray(rows.record.observed, coords, dims)
     tree["observed_data"] = xr.DataTree(data.assign({name: array}))
-    course = tree[COURSE].to_dataset().assign_coords(row=rows.shown_times)
+    course = (
+        tree[COURSE].to_dataset().assign_coords(row=rows.shown_times, observable=coords[dims[1]])
+    )
     tree[COURSE] = xr.DataTree(course)
     if (state := stored(progress, request)) is not None:
         tree[GROUP] = xr.DataTree(state)

@@ -23,12 +23,13 @@ from ..importance import systematic
 from ..smc.bridge import Cloud, Crossed, Stage, cross, sizes_of_evidence
 from ..smc.merging import merged_scores
 from ..smc.particles import Populations
+from .calibration import transform_of_row
 from .observed_rows import ObservedRows, exchanged, exchanging
 from .request import Request, Run, check_alive, least_alive
 
 MAX_VARIANCE = 2.0  # of the log-likelihood at fixed parameters; beyond it members are doubled
 N_POINTS, N_REPEATS = 8, 8  # at and by which it is measured
-_PRIOR, _ROW = 0, 1  # keys of random numbers
+_PRIOR, _ROW, _PREDICTED = 0, 1, 2  # keys of random numbers
 
 Array = NDArray[np.float64]
 
@@ -37,6 +38,7 @@ class RowCourse(NamedTuple):
     """What happened at one row; of the populations (R,), log-evidences are those so far."""
 
     log_evidence: Array
+    pit: Array  # of each observable, before the row was seen
     effective_size: Array
     n_alive: NDArray[np.int64]  # particles of positive likelihood, before any move
     n_stages: int
@@ -67,6 +69,8 @@ class Progress(NamedTuple):
     @property
     def log_evidences(self) -> Array:
         """Of each population, (R,)."""
+        if not self.courses:
+            return np.zeros(len(self.cloud.others.log_weights))
         return self.courses[-1].log_evidence
 
     def as_run(self) -> Run:
@@ -87,7 +91,8 @@ def advance(progress: Progress, request: Request, show: Callable[[float, str], N
 def _next_row(progress: Progress, request: Request) -> Progress:
     rows, cloud, row = progress.rows, progress.cloud, progress.n_rows
     rng = request.generator(_ROW, row)
-    before = 0.0 if row == 0 else progress.log_evidences
+    before = progress.log_evidences
+    pit = transform_of_row(rows, cloud.others, before, row, request.generator(_PREDICTED, row))
     pilot, others = (
         one._replace(particles=rows.with_row(one.particles, row))
         for one in (cloud.pilot, cloud.others)
@@ -109,6 +114,7 @@ def _next_row(progress: Progress, request: Request) -> Progress:
             n_updates += (row + 1) * (request.n_particles + 2 * _n_proposals(found.stages, request))
     course = RowCourse(
         log_evidence,
+        pit,
         sizes_of_evidence(found.cloud.others, log_evidence),
         n_alive,
         len(stages),
@@ -182,17 +188,19 @@ def course_dataset(courses: list[RowCourse]) -> xr.Dataset:
         if name in names
     }
     paths = np.stack([one.log_evidence for one in courses], axis=1)
+    scores, deviations = merged_scores(paths)
     sizes, alive = (
         np.stack([getattr(one, name) for one in courses], axis=1)
         for name in ("effective_size", "n_alive")
     )
-    scores, errors = merged_scores(paths)
     of_populations = ("population", "row")
     return xr.Dataset(
         {
             **found,
             "score": ("row", scores),
-            "score_se": ("row", errors),
+            "score_se": ("row", np.sqrt((deviations**2).sum(axis=0))),
+            "score_deviation": (of_populations, deviations),
+            "pit": (("row", "observable"), np.stack([one.pit for one in courses])),
             "effective_size": (of_populations, sizes),
             "n_alive": (of_populations, alive),
             "log_evidence_so_far": (of_populations, paths),

@@ -8,7 +8,7 @@ import xarray as xr
 from arviz_plots import PlotCollection
 from arviz_plots.plot_collection import backend_from_object
 
-from ..parameter_particles.running_comparison import running_comparison
+from ..parameter_particles import compare_prequential
 from .canvas import add_legend, band, curve, interval, label_axes
 from .marks import canvas_over_time
 
@@ -50,6 +50,10 @@ def plot_prequential(
     DataMismatchError
         If they are of different rows or data.
 
+    See Also
+    --------
+    compare_prequential : The numbers.
+
     Examples
     --------
     >>> import pymc as pm
@@ -70,7 +74,7 @@ def plot_prequential(
     >>> collection = psf.plot_prequential({"persistent": run(0.9), "alternating": run(-0.9)})
     >>> collection.savefig("prequential.png")  # doctest: +SKIP
     """
-    table = running_comparison(results).rename(row="time")
+    table = compare_prequential(results).rename(row="time")
     models = [str(name) for name in table["model"].values]
     first = table[PANELS[0]].isel(model=0, drop=True)
     shape = xr.Dataset({"value": first.expand_dims(panel=list(PANELS))})

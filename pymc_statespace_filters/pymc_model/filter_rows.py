@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from pymc.pytensorf import compile as compile_pymc
 from pytensor.graph.basic import Variable
 
+from ..compiler.lowering.compiled_system import compile_system
 from ..compiler.native.planned_function import PlannedFunction
 from ..compiler.native.planned_rows import PlannedRow
 from ..compiler.native.rows import Rows, at_points
-from ..filters.protocol import Filter
+from ..filters.protocol import Filter, ResumableFilter
 from ..filters.signatures import RESUMED
+from ..filters.state_law import StateLaw
 from ..ops.base import kernel
 from ..ops.states import ResumableRun
 from ..system.model import StateSpaceModel
@@ -69,7 +71,7 @@ class FilterRows:
     """The filter of one system along rows of a record, for many parameters and seeds at once."""
 
     def __init__(self, system: StateSpaceModel, filter: Filter) -> None:
-        self.filter = filter
+        self.filter, self._system = filter, system
         function = kernel(ResumableRun(system, filter))
         assert isinstance(function, PlannedFunction)  # all filters that resume have a plan
         self._function = function.loaded()
@@ -96,3 +98,8 @@ class FilterRows:
         row = PlannedRow(self._function, [_ARGUMENTS.index(name) for name in order], example, _KEPT)
         terms, after = Rows(row, len(varying))(*varying.values())
         return terms, after
+
+    def law_of_state(self, states: Array) -> StateLaw:
+        """The law of the system's state at the points, from what the filter has left."""
+        assert isinstance(self.filter, ResumableFilter)
+        return self.filter.law_of_state(compile_system(self._system), states)

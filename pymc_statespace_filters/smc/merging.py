@@ -31,16 +31,18 @@ def merged_log_evidence(log_evidences: Array) -> tuple[Array, Array]:
 
 
 def merged_scores(log_evidences: Array) -> tuple[Array, Array]:
-    """Scores log p(d_j | d_1 .. d_{j-1}) from evidences (R, J) of the data up to j; their errors.
+    """Scores log p(d_j | d_1 .. d_{j-1}) from evidences (R, J) of the data up to j; deviations.
 
-    Errors of evidences of successive rows are nearly the same, and cancel in their ratio.
+    The deviations (R, J) of the populations are scaled so that the sum over populations of the
+    product of two columns is the covariance of the errors of two scores. Errors of evidences of
+    successive rows are nearly the same, and cancel in their ratio.
     """
     count = len(log_evidences)
     before = np.concatenate([np.zeros((count, 1)), log_evidences[:, :-1]], axis=1)
     merged, merged_before = (merged_log_evidence(values)[0] for values in (log_evidences, before))
     influence = np.exp(log_evidences - merged) - np.exp(before - merged_before)
-    error = influence.std(axis=0, ddof=1) / math.sqrt(count) * student_factor(count)
-    return merged - merged_before, error
+    scale = student_factor(count) / math.sqrt(count * (count - 1))
+    return merged - merged_before, influence * scale
 
 
 def merged_index(

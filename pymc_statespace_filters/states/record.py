@@ -206,6 +206,6 @@ def simulate_observations(
         known = np.isfinite(path).all(axis=1)
         inputs = rows[i if len(rows) > 1 else 0]
         simulated[i, known] = call_machine_code(
-            observe, rng, record.theta[i], path[known], steps[known], inputs, record.t0
+            observe, rng, record.theta[i : i + 1], path[known], steps[known], inputs, record.t0
         )
     return simulated

@@ -6,7 +6,6 @@ from scipy.stats import kstest, norm
 
 from pymc_statespace_filters.diagnostics.calibration import (
     coverage_of,
-    pit_of,
     residual_limit,
     uniformity_of,
     whiteness_of,
@@ -16,6 +15,7 @@ from pymc_statespace_filters.diagnostics.predictions import (
     calibration_by_rank,
     calibration_of,
 )
+from pymc_statespace_filters.pit import pit_of
 
 
 def test_the_place_of_a_datum_among_draws():

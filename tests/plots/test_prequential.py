@@ -6,7 +6,6 @@ import xarray as xr
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.parameter_particles.running_comparison import running_comparison
 from tests.plots.drawn import drawn
 
 ROWS = np.array([2.0, 5.0, 6.0])
@@ -38,7 +37,7 @@ NOISY = RIVALS | {"two": course(np.add.outer([0.2, -0.2], [-2.0, -2.0, -3.0]))}
 
 
 def test_numbers():
-    table = running_comparison(RIVALS)
+    table = psf.compare_prequential(RIVALS)
     np.testing.assert_allclose(table["score_difference"].sel(model="two"), [-1.0, 1.0, 1.0])
     np.testing.assert_allclose(table["log_bayes_factor"].sel(model="two"), [-1.0, 0.0, 1.0])
     odds = 1 / (1 + np.exp([1.0, 0.0, -1.0]))
@@ -48,7 +47,7 @@ def test_numbers():
 
 
 def test_errors_widen_bands():
-    table = running_comparison(NOISY).sel(model="two")
+    table = psf.compare_prequential(NOISY).sel(model="two")
     assert (table["log_bayes_factor_se"] > 0.2).all()
     assert (table["probability_low"] < table["probability"]).all()
     assert (table["probability_high"] > table["probability"]).all()

@@ -54,10 +54,11 @@ def test_intervals_from_few_populations_hold():
 def test_errors_common_to_all_rows_cancel_in_scores():
     path = np.cumsum(RNG.standard_normal(6))
     common = 0.1 * RNG.standard_normal((8, 1))
-    scores, errors = merged_scores(path + common)
+    scores, deviations = merged_scores(path + common)
     np.testing.assert_allclose(scores[1:], np.diff(path), atol=1e-12)
-    np.testing.assert_allclose(errors[1:], 0.0, atol=1e-12)
-    assert errors[0] == pytest.approx(merged_log_evidence(path[0] + common[:, 0])[1])
+    np.testing.assert_allclose(deviations[:, 1:], 0.0, atol=1e-12)
+    error = np.linalg.norm(deviations[:, 0])
+    assert error == pytest.approx(merged_log_evidence(path[0] + common[:, 0])[1])
 
 
 def test_a_population_without_likelihood_has_no_evidence_and_keeps_its_particles():

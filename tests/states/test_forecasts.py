@@ -185,7 +185,7 @@ def test_observations_of_given_states():
     states = np.random.default_rng(1).normal(size=(3, 1))
     force = np.asarray(FORCE)[:, None]
     look, rng = observer(PUSHED).function, np.random.default_rng(2)
-    seen = np.array([look(rng, np.array([0.7]), states, steps, force, T0) for _ in range(4000)])
+    seen = np.array([look(rng, np.array([[0.7]]), states, steps, force, T0) for _ in range(4000)])
     mean = states[:, 0] + shown(steps, FORCE)
     assert_drawn_from(seen[:, :, 0], mean, 0.5 * np.eye(3), RATE)
 

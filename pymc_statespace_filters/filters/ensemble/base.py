@@ -18,6 +18,7 @@ from ...system.checks import is_integer
 from ..plan import make_plan
 from ..protocol import System, check_sensor_has_noise
 from ..signatures import LIKELIHOOD_OF_NOISE, NORMALS, RUN, STATES, TERM_HEALTH
+from ..state_law import StateLaw, law_of_members
 from .noise import STORE_NORMALS, NoiseSizes, n_stored
 from .summaries import LAST_EVENTS, MEMBER_RUN, MEMBER_STATES, STORE_MEMBERS, SUMMARISE
 
@@ -93,6 +94,10 @@ class EnsembleFilterBase:
     def ordering(self) -> EntryPoint | None:
         """Return the function that sorts members, if the filter sorts them."""
         return None
+
+    def law_of_state(self, system: System, states: np.ndarray) -> StateLaw:
+        """Return the law of the state, from what the filter leaves (m, S) at m points."""
+        return law_of_members(states, system.n)
 
     def algorithm(self, system: System) -> "EnsembleFilterBase":
         """Return the filter that treats this system: itself, unless it reduces to another."""

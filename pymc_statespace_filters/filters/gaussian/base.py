@@ -3,6 +3,7 @@
 from functools import lru_cache
 from typing import ClassVar
 
+import numpy as np
 import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
@@ -16,6 +17,7 @@ from ...errors import ModelError
 from ...system.model import StateSpaceModel
 from ..protocol import System, check_sensor_has_noise
 from ..signatures import RUN, STATES
+from ..state_law import StateLaw, law_of_moments
 from ..taped import TapedFilter
 from .backward import BACKWARD
 from .forward import FORWARD
@@ -81,6 +83,10 @@ class GaussianFilterBase(TapedFilter):
     def compile_run(self, system: System) -> PlannedFunction:
         """Compile one run with all that it computes."""
         return PlannedFunction(self._plan(system, RUN_STATES), *RUN)
+
+    def law_of_state(self, system: System, states: np.ndarray) -> StateLaw:
+        """Return the law of the state, from what the filter leaves (m, S) at m points."""
+        return law_of_moments(states, system.n)
 
     def _plan(
         self, system: System, run: EntryPoint, *, of_many: bool = False, leaves_tape: bool = False

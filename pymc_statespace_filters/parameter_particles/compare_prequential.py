@@ -14,20 +14,62 @@ N_SIMULATED, SEED = 2000, 0  # of evidences within their errors, for intervals o
 INTERVAL = 0.025, 0.975
 
 
-def running_comparison(results: Mapping[str, Any]) -> xr.Dataset:
-    """Sequential runs of several models over the same rows, against the first of them.
+def compare_prequential(results: Mapping[str, xr.DataTree]) -> xr.Dataset:
+    """Compare rival models row by row, with the errors of all numbers.
 
-    Along ``model`` and ``row``: ``score_difference``, of log p(d_j | d_1 .. d_{j-1}), and
-    ``log_bayes_factor``, its sum, with ``_se``; ``probability`` of the models if they were equally
-    likely before the data, with ``probability_low`` and ``probability_high`` by the errors of the
-    evidences.
+    Parameters
+    ----------
+    results : mapping of str to xarray.DataTree
+        Results of `sample_smc` with ``data="sequential"``, or of `extend`, of at least two models
+        of the same rows; the others are compared with the first.
+
+    Returns
+    -------
+    xarray.Dataset
+        Along ``model`` and ``row``: ``score_difference``, of log p(d_j | d_1 .. d_{j-1}) with the
+        parameters integrated out, and its sum so far, ``log_bayes_factor``, each with its standard
+        error ``_se``; ``probability`` of the models if they were equally likely before the data,
+        with the ends ``probability_low`` and ``probability_high`` of a 95 % interval by the errors
+        of the evidences.
 
     Raises
     ------
     ModelError
-        If ``results`` are not sequential runs of at least two models.
+        If `results` are not sequential runs of at least two models.
     DataMismatchError
-        If their rows differ.
+        If they are of different rows or data.
+
+    See Also
+    --------
+    plot_prequential : The same as a plot.
+    compare_evidence : Models by their evidence, from any sampler.
+
+    Notes
+    -----
+    The errors of the scores of a model are correlated: where a row was hard, its error may take
+    itself back in the next ones. The sum of scores has the error of the evidence, not that of a sum
+    of independent numbers. For the sum over other rows see ``score_deviation`` of `sample_smc`.
+
+    Examples
+    --------
+    >>> import pymc as pm
+    >>> import pymc_statespace_filters as psf
+    >>> system = psf.StateSpaceModel(
+    ...     transition=lambda x, q, a: [a * x[0] + q[0]],
+    ...     process_noise=[[1.0]],
+    ...     observation=lambda x: [x[0]],
+    ...     observation_noise=[[0.5]],
+    ...     initial_mean=[0.0],
+    ...     initial_cov=[[1.0]],
+    ... )
+    >>> def run(centre):
+    ...     with pm.Model():
+    ...         pm.Normal("a", centre, 0.2)
+    ...         psf.StateSpace("d", system, psf.EKF(), steps=[1, 2, 3], observed=[0.9, 1.4, 1.8])
+    ...         return psf.sample_smc(50, data="sequential", random_seed=1, progressbar=False)
+    >>> table = psf.compare_prequential({"persistent": run(0.9), "alternating": run(-0.9)})
+    >>> table["probability"].sel(model="persistent").values.round(1)
+    array([0.5, 0.8, 0.9])
     """
     courses = _courses(results)
     paths = [course["log_evidence_so_far"].values for course in courses.values()]
