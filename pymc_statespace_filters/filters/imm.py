@@ -1,7 +1,6 @@
 """Interacting multiple model filter: a Gaussian for each regime of a system that switches."""
 
 from dataclasses import KW_ONLY, dataclass, field
-from typing import NoReturn
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from .gaussian.base import GaussianFilterBase
 from .gaussian.functions import GaussianFilterFunctions
 from .iplf import IPLF
 from .protocol import System
-from .regimes.checks import check_hybrid, check_inner, refuse_smoothing
+from .regimes.checks import check_hybrid, check_inner
 from .regimes.hybrid import hybrid_of
 from .regimes.mixture import mixture_functions
 from .regimes.mixture_states import states_plan
@@ -102,11 +101,9 @@ class IMM(GaussianFilterBase):
         return hybrid_of(system.written).is_smooth
 
     def compile_states(self, system: System, moment: str) -> PlannedFunction:
-        """Compile "predicted" or "filtered" states."""
-        if moment == "smoothed":
-            self.smoothing_method(system)
-        hybrid = hybrid_of(system.model)
-        plan = states_plan(system, hybrid, self._functions(system), moment)
+        """Compile "predicted", "filtered" or "smoothed" states."""
+        hybrid, by = hybrid_of(system.model), self.inner.linearization
+        plan = states_plan(system, hybrid, by, self._functions(system), moment)
         return PlannedFunction(plan, *STATES)
 
     def law_of_state(self, system: System, states: np.ndarray) -> StateLaw:
@@ -114,9 +111,9 @@ class IMM(GaussianFilterBase):
         hybrid = hybrid_of(system.model)
         return law_of_regimes(states, hybrid.regimes, hybrid.order)
 
-    def smoothing_method(self, system: System) -> NoReturn:
-        """Raise: the filter has no smoother."""
-        refuse_smoothing("IMM")
+    def smoothing_method(self, system: System) -> str:
+        """Name the method of the smoothed states."""
+        return "backward simulation"
 
     def _functions(self, system: System) -> GaussianFilterFunctions:
         return mixture_functions(system.model, self.inner.linearization)

@@ -84,6 +84,7 @@ class PlanSlots(NamedTuple):
     # of particles with Kalman filters, see `regimes.particles`
     condition: int = N_HEADER + 55
     move_to_observation: int = N_HEADER + 56
+    moves: int = N_HEADER + 57  # of the parts of a mixture, see `regimes.moves`
 
 
 PLAN = PlanSlots()

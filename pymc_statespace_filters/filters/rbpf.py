@@ -6,7 +6,7 @@ front of an observation, which tries all that may happen. See `regimes.particles
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field
-from typing import ClassVar, NoReturn
+from typing import ClassVar
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from ..compiler.native.planned_function import PlannedFunction
 from ..compiler.numerics.normals import FILL_NORMALS, padded
 from .calls import OK, likelihood_entry, state_given
 from .ekf import EKF
+from .ensemble.backward_simulation import STORE
 from .ensemble.callbacks import FORECAST, RESAMPLED, UPDATED, emit
 from .ensemble.failures import failure_of_all
 from .ensemble.kalman_update import mark_finite
@@ -41,9 +42,15 @@ from .iplf import IPLF
 from .outcomes import NONE, is_missing
 from .plan import NULL, PLAN, call_members, make_plan, propagate, read_system, settings_of
 from .protocol import System
-from .regimes.checks import check_hybrid, check_inner, refuse_smoothing
+from .regimes.checks import check_hybrid, check_inner
 from .regimes.hybrid import hybrid_of
-from .regimes.particle_states import RUN_OF_MIXTURE, STATES_OF_MIXTURE, SUMMARISE_MIXTURE
+from .regimes.moves import moves_of_parts
+from .regimes.particle_states import (
+    RUN_OF_MIXTURE,
+    SMOOTH_MIXTURE,
+    STATES_OF_MIXTURE,
+    SUMMARISE_MIXTURE,
+)
 from .regimes.particles import HybridParticles, hybrid_particles
 from .signatures import RUN, STATES
 from .state_law import StateLaw, weighted_columns
@@ -243,9 +250,9 @@ class RBPF(ParticleFilter):
         return "initialise", "propagate", "log_density"
 
     def compile_states(self, system: System, moment: str) -> PlannedFunction:
-        """Compile "predicted" or "filtered" states."""
+        """Compile "predicted", "filtered" or "smoothed" states."""
         if moment == "smoothed":
-            self.smoothing_method(system)
+            return PlannedFunction(self.smoother(system), *STATES)
         return PlannedFunction(self._observed(system, STATES_OF_MIXTURE, moment), *STATES)
 
     def compile_run(self, system: System) -> PlannedFunction:
@@ -262,9 +269,14 @@ class RBPF(ParticleFilter):
         n_finite, order = particles.hybrid.regimes.shape[1], particles.hybrid.order
         return weighted_columns(states, particles.system.n, n_finite, order)
 
-    def smoothing_method(self, system: System) -> NoReturn:
-        """Raise: the filter has no smoother."""
-        refuse_smoothing("RBPF")
+    def smoother(self, system: System) -> Plan:
+        """Plan backward simulation."""
+        moves = moves_of_parts(system.written, self.inner.linearization).entry
+        return self.observed(system, SMOOTH_MIXTURE, observer=STORE, moves=moves)
+
+    def smoothing_method(self, system: System) -> str:
+        """Name the method of the smoothed states."""
+        return "backward simulation"
 
     def plan(
         self, system: System, run: EntryPoint, functions: Sequence[str], **others: int | EntryPoint
@@ -277,10 +289,13 @@ class RBPF(ParticleFilter):
             others |= {name: getattr(particles, name).entry for name in names}
         if order is not None:
             others["order"] = order
-        sizes = (size, *self.noise_sizes(system), *self.settings())
+        settings = (
+            size, *self.noise_sizes(system), *self.settings(), hybrid.regimes.shape[1],
+            len(hybrid.drawn), *hybrid.order,
+        )  # fmt: skip
         return make_plan(
-            particles.system, run, functions, (*sizes, hybrid.regimes.shape[1], *hybrid.order),
-            n_members=size, state_size=1 + (particles.system.n + 1) * size, **others,
+            particles.system, run, functions, settings, n_members=size,
+            state_size=1 + (particles.system.n + 1) * size, **others,
         )  # fmt: skip
 
     def _particles(self, system: System) -> HybridParticles:

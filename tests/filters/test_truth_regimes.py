@@ -434,14 +434,98 @@ def test_drawn_states_are_those_of_the_mixture(filter, draws):
         found = psf.filtered_states(draws, random_seed=1, progressbar=False)
         inputs = np.zeros((10, 1))
         ahead = psf.forecast(draws, n_steps=2, inputs=inputs, progressbar=False, n_draws=20)
-        with pytest.raises(ModelError, match="gives no smoothed states; name a filter"):
-            psf.smoothed_states(draws, progressbar=False)
     last = found["filtered_states"]["d_states"].isel(d_time=-1, chain=0).values
     assert set(last[:, 1]) == {0.0, 1.0}
     assert last[:, 1].mean() == pytest.approx(weights[1], abs=0.06)
     assert last[:, 0].mean() == pytest.approx(mean[0], abs=0.04)
     assert last[:, 0].std() == pytest.approx(np.sqrt(cov[0, 0]), rel=0.1)
     assert np.isfinite(ahead["predictions"]["d"].values).all()
+
+
+FOUR_ERRORS = 4.0 * 0.13 / 10
+"""Of the mean of a hundred means of noisy filters, which have deviations up to 0.13."""
+
+
+@pytest.mark.parametrize(
+    ("filter", "tolerance"), [(psf.IMM(), 0.06), (psf.RBPF(100), FOUR_ERRORS)], ids=str
+)
+def test_smoothed_states_are_those_of_all_paths(filter, tolerance, draws):
+    """Those of merged regimes have a bias."""
+    with model_of(filter):
+        arguments = {"n_draws": 100, "random_seed": 1, "progressbar": False}
+        all_steps = psf.smoothed_states(draws, at="steps", **arguments)["smoothed_states"]
+        at_data = psf.smoothed_states(draws, **arguments)["smoothed_states"]
+    weights, mean, cov = EXACT.smoothed_moments(STEPS, OBSERVED, INPUTS)
+    check_smoothed(all_steps, mean, cov, weights[:, 1], tolerance)
+    assert all_steps["d_states"].attrs["smoothing"] == "backward simulation"
+    for name in at_data.data_vars:
+        assert np.array_equal(at_data[name], all_steps[name].isel(d_time=STEPS))
+
+
+def check_smoothed(found, mean, cov, probability, tolerance):
+    """Compare states that end with a regime of two values; draws have the errors of a hundred."""
+    exact = np.column_stack([mean, probability])
+    variances = np.diagonal(cov, axis1=1, axis2=2)
+    sd = np.sqrt(np.column_stack([variances, probability * (1 - probability)]))
+    means, sds, states = (found[f"d_{name}"][0].values for name in ("mean", "sd", "states"))
+    whole_sd = np.sqrt(np.mean(sds**2, axis=0) + means.var(axis=0))
+    np.testing.assert_allclose(means.mean(axis=0), exact, atol=tolerance)
+    np.testing.assert_allclose(whole_sd, sd, atol=tolerance + 0.01)
+    of_draws = tolerance + 4.0 * sd / len(states) ** 0.5
+    assert (np.abs(states.mean(axis=0) - exact) <= of_draws).all()
+    assert set(np.unique(states[..., -1])) <= {0.0, 1.0}
+
+
+# A body with noise on the velocity alone, from a known start, whose damping and force switch.
+DAMPING, FORCE, PUSH = (0.8, 0.2), (0.0, 0.6), 0.4
+BODY = switching(
+    transition=lambda x, q: [
+        x[0] + 0.5 * x[1],
+        of(DAMPING, q[0]) * x[1] - 0.4 * x[0] + of(FORCE, q[0]) + q[1],
+        q[0],
+    ],
+    process_dist=lambda x, stay_0, stay_1: [
+        pm.Bernoulli.dist(pt.switch(x[2] > 0.5, stay_1, 1.0 - stay_0)),
+        pm.Normal.dist(0, PUSH),
+    ],
+    observation_noise=[[0.003**2]],
+    initial_dist=lambda: [1.0, 0.0, pm.Bernoulli.dist(0.5)],
+    states=["position", "velocity", "regime"],
+    inputs=(),
+)
+
+
+@pytest.mark.parametrize(
+    ("filter", "steps", "tolerance"),
+    [
+        (psf.IMM(), np.arange(1, 8), 0.06),
+        (psf.RBPF(100), np.array([1, 3, 4, 6, 7]), FOUR_ERRORS),
+    ],
+    ids=["IMM", "RBPF"],
+)
+def test_smoothed_paths_where_a_state_has_no_noise(filter, steps, tolerance, draws):
+    """With a precise sensor; a step of the position is known given the velocity."""
+    exact = SwitchingSystem(
+        P=EXACT.P,
+        A=np.array([[[1.0, 0.5], [-0.4, damping]] for damping in DAMPING]),
+        b=np.column_stack([np.zeros(2), FORCE]),
+        Q=np.array(2 * [np.diag([0.0, PUSH**2])]),
+        H=np.array([[1.0, 0.0]]),
+        R=np.array([[0.003**2]]),
+        start=EXACT.start,
+        mean=np.array([1.0, 0.0]),
+        cov=np.zeros((2, 2)),
+    )
+    observed = psf.simulate(BODY, PARAMS, steps=steps, random_seed=3)["observations"].values
+    with model_of(filter, BODY, observed=observed, steps=steps, inputs=None):
+        found = psf.smoothed_states(
+            draws, at="steps", n_draws=100, random_seed=1, progressbar=False
+        )["smoothed_states"]
+    weights, mean, cov = exact.smoothed_moments(steps, observed, np.zeros((8, 1)))
+    check_smoothed(found, mean, cov, weights[:, 1], tolerance)
+    position, velocity, _ = np.moveaxis(found["d_states"][0].values, -1, 0)
+    moved = position[:, :-1] + 0.5 * velocity[:, :-1]
+    np.testing.assert_allclose(position[:, 1:], moved, atol=1e-5)
 
 
 def test_a_panel_is_its_records():

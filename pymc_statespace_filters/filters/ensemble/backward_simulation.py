@@ -50,10 +50,16 @@ STORE = EntryPoint(_store, CALLBACK_ARGUMENTS, "store_particles")
 
 
 @njit_internal
+def n_paths_of(n_particles):
+    """How many paths are drawn through so many particles."""
+    return max(_LEAST_PATHS, n_particles // PARTICLES_PER_PATH)
+
+
+@njit_internal
 def _simulate_backward(system, t0, seed, N, n_steps, stored, rows, out):
     """Write what rows are summarised to; False if a covariance of a step is singular."""
     n, width, R = system.n, -(-N // 64) * 64, rows.size
-    size, M = (n + 1) * N, max(_LEAST_PATHS, N // PARTICLES_PER_PATH)
+    size, M = (n + 1) * N, n_paths_of(N)
     paths, chosen = np.empty((M, n)), np.empty(M, np.int64)
     kernel = (np.empty((n, N)), np.empty((N, n, n)), np.empty(N))
     noise, scratch = np.zeros((system.m, width)), np.empty((n, N))

@@ -157,12 +157,19 @@ def predict(
     linearization: Linearization, system: StateSpaceModel, values: Symbols
 ) -> TensorVariable:
     """Eqs. 4.8-4.11: one step from the state ``values["s"]``."""
+    return predict_with_cross(linearization, system, values)[0]
+
+
+def predict_with_cross(
+    linearization: Linearization, system: StateSpaceModel, values: Symbols
+) -> tuple[TensorVariable, TensorVariable]:
+    """The same, and the covariance (n, n) of the states before and after the step."""
     state = linearization.state(*unpack(values["s"], system.n))
     step = linearization.transition(system, values, state)
     forecast_cov = product(step.jac, state.cov, step.jac.T)
     if step.noise_cov is not None:
         forecast_cov += step.noise_cov
-    return pack(step.mean, forecast_cov)
+    return pack(step.mean, forecast_cov), product(state.root, state.cov, step.jac.T)
 
 
 def update(

@@ -1,6 +1,6 @@
 """Which systems filters of regimes take, and with which Gaussian filters inside."""
 
-from typing import Any, NoReturn
+from typing import Any
 
 from ...compiler.lowering.compiled_system import compile_system
 from ...errors import ModelError
@@ -18,14 +18,6 @@ def check_inner(inner: Any) -> None:
     """Raise unless this is a Gaussian filter of the states given the regimes."""
     if not isinstance(inner, EKF | UKF | IPLF):
         raise ModelError(f"inner must be psf.EKF(), psf.UKF() or psf.IPLF(), got {inner!r}")
-
-
-def refuse_smoothing(name: str) -> NoReturn:
-    """Raise: the filter has no smoother."""
-    raise ModelError(
-        f"{name} gives no smoothed states; name a filter that does, such as "
-        "filter=psf.BootstrapPF(1000)"
-    )
 
 
 def check_hybrid(name: str, system: System, inner: EKF | UKF | IPLF) -> Hybrid:

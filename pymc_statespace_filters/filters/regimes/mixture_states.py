@@ -1,10 +1,16 @@
-"""States of the filter of merged regimes: its moments, and draws of regime and other states."""
+"""States of the filter of merged regimes: its moments, and draws of regime and other states.
+
+Smoothed states are those of paths drawn back, see `backward_simulation`.
+"""
+
+from typing import NamedTuple
 
 import numpy as np
 
 from ...compiler.native.jit import njit_internal
 from ...compiler.native.plan import REQUEST, RESULTS, Plan, plan_entry
-from ..calls import OK, opened, wanted_rows
+from ..calls import ALL_STEPS, OK, opened, wanted_rows
+from ..ensemble.summaries import write_summaries
 from ..gaussian.functions import (
     GaussianFilterFunctions,
     checked,
@@ -13,9 +19,11 @@ from ..gaussian.functions import (
     forward_functions,
 )
 from ..gaussian.group import parameters_of, set_all, table_of
+from ..gaussian.linearization import Linearization
 from ..gaussian.machine import read_machine
 from ..gaussian.states import (
     MOMENTS,
+    n_steps_of,
     new_health,
     places_on_tape,
     read_moments,
@@ -24,25 +32,39 @@ from ..gaussian.states import (
 )
 from ..plan import PLAN, make_plan, settings_of
 from ..protocol import System
+from .backward_simulation import Mixtures, simulate_backward
 from .hybrid import Hybrid
 from .moments import draw_of_mixture
+from .moves import moves_of_parts
 
-_N_HEADER = 3  # the number of settings of covariances, of finite states, and of regimes
+# The number of settings of covariances, of finite states, of regimes, and of draws in a step.
+_N_HEADER = 4
+
+N_PATHS = 128
+"""Paths of which smoothed states are the mean."""
 
 
 def states_plan(
-    system: System, hybrid: Hybrid, recursion: GaussianFilterFunctions, moment: str
+    system: System,
+    hybrid: Hybrid,
+    linearization: Linearization,
+    recursion: GaussianFilterFunctions,
+    moment: str,
 ) -> Plan:
-    """The plan of "predicted" or "filtered" states."""
+    """The plan of "predicted", "filtered" or "smoothed" states."""
     functions, theta = forward_functions(recursion, in_lanes=False), recursion.start.inputs["theta"]
     covs = covariances_at(recursion.system, theta)
     checks = checked(recursion.system, covs, theta.type.shape[0])
     n_regimes, n_finite = hybrid.regimes.shape
     settings = (
-        len(checks), n_finite, n_regimes, *checks, *hybrid.order, *hybrid.regimes.ravel()
+        len(checks), n_finite, n_regimes, len(hybrid.drawn), *checks, *hybrid.order,
+        *hybrid.regimes.ravel(),
     )  # fmt: skip
+    entries = {**functions.entries, **extensions(system)}
+    if moment == "smoothed":
+        entries["moves"] = moves_of_parts(hybrid.system, linearization).entry
     return make_plan(
-        system, _STATES, (), settings, **functions.entries, **extensions(system),
+        system, _SMOOTHED if moment == "smoothed" else _STATES, (), settings, **entries,
         state_size=recursion.size, n_lanes=1, n_rows=functions.n_rows,
         n_covariances=covs.values.type.shape[0], last_event=MOMENTS[moment],
     )  # fmt: skip
@@ -62,33 +84,88 @@ def _parts(s, n, n_finite, regimes):
     return w, X
 
 
-def _states(plan, record, request, results):
-    status, opening = opened(plan, record, request, results)
-    if status != OK or opening.request[REQUEST.sizes_only]:
-        return status
-    rows, to, machine = wanted_rows(opening), opening.results, read_machine(opening.plan)
-    n_wanted, n, given = rows.size, machine.n, settings_of(opening.plan)
+class _Settings(NamedTuple):
+    """The settings of a plan; ``order`` and ``regimes`` as in `Hybrid`."""
+
+    checks: np.ndarray
+    n_finite: int
+    n_draws: int
+    order: np.ndarray
+    regimes: np.ndarray
+
+
+@njit_internal
+def _settings(plan):
+    given, n = settings_of(plan), plan[PLAN.n]
     n_checks, n_finite, K = int(given[0]), int(given[1]), int(given[2])
     first = _N_HEADER + n_checks
     order = np.empty(n, np.int64)
     for a in range(n):
         order[a] = int(given[first + a])
-    regimes = given[first + n :].copy().reshape((K, n_finite))
+    return _Settings(
+        checks=given[_N_HEADER:first], n_finite=n_finite, n_draws=int(given[3]), order=order,
+        regimes=given[first + n :].copy().reshape((K, n_finite)),
+    )  # fmt: skip
+
+
+def _states(plan, record, request, results):
+    status, opening = opened(plan, record, request, results)
+    if status != OK or opening.request[REQUEST.sizes_only]:
+        return status
+    rows, to, machine = wanted_rows(opening), opening.results, read_machine(opening.plan)
+    n_wanted, n, given = rows.size, machine.n, _settings(opening.plan)
     mean, sd = room(to[RESULTS.mean], n_wanted, n), room(to[RESULTS.sd], n_wanted, n)
     drawn = room(to[RESULTS.drawn], n_wanted, n)
     n_effective = room(to[RESULTS.n_effective_wanted], n_wanted, 1)
     health, seed = new_health(to), opening.request[REQUEST.draw_seed]
     table = table_of(opening, parameters_of(opening), np.empty((0, 0)), np.empty(0))
-    tape, end = taped_pass(opening, machine, given[_N_HEADER:first], table, health)
+    tape, end = taped_pass(opening, machine, given.checks, table, health)
     is_predicted = opening.plan[PLAN.last_event] == 0
     places = places_on_tape(rows, table.rows[:, 0], end, is_predicted)
     for r in range(places.size):
         s = tape[places[r]]
         read_moments(s, mean[r], sd[r])
-        w, X = _parts(s, n, n_finite, regimes)
-        draw_of_mixture(w, X, n_finite, order, seed, rows[r], drawn[r])
+        w, X = _parts(s, n, given.n_finite, given.regimes)
+        draw_of_mixture(w, X, given.n_finite, given.order, seed, rows[r], drawn[r])
         set_all(n_effective[r], np.inf)
     return OK
 
 
+@njit_internal
+def _stored(tape, table, given, n):
+    """The mixtures of all steps, from the tape of a record that did not fail."""
+    steps = np.arange(n_steps_of(table) + 1)
+    places = places_on_tape(steps, table.rows[:, 0], steps.size, False)
+    _, X = _parts(tape[0], n, given.n_finite, given.regimes)
+    stored = np.empty((steps.size, X.shape[0] + 1, X.shape[1]))
+    for k in range(steps.size):
+        w, X = _parts(tape[places[k]], n, given.n_finite, given.regimes)
+        stored[k, :-1] = X
+        stored[k, -1] = np.log(w)
+    return stored
+
+
+def _smoothed(plan, record, request, results):
+    status, opening = opened(plan, record, request, results)
+    if status != OK or opening.request[REQUEST.sizes_only]:
+        return status
+    rows, machine, given = wanted_rows(opening), read_machine(opening.plan), _settings(opening.plan)
+    n, health = machine.n, new_health(opening.results)
+    table = table_of(opening, parameters_of(opening), np.empty((0, 0)), np.empty(0))
+    tape, end = taped_pass(opening, machine, given.checks, table, health)
+    reals = np.full((3 * n + 1) * rows.size, np.nan)
+    is_known = end > n_steps_of(table)
+    if is_known:
+        mixtures = Mixtures(
+            stored=_stored(tape, table, given, n), n_finite=given.n_finite, order=given.order,
+            moves=opening.plan[PLAN.moves], n_draws=given.n_draws, c=table.theta[0],
+            inputs=table.inputs, t0=table.t0, dt=machine.dt,
+        )  # fmt: skip
+        simulate_backward(mixtures, N_PATHS, opening.request[REQUEST.draw_seed], rows, reals)
+        set_all(reals[3 * n * rows.size :], N_PATHS)
+    write_summaries(opening, reals, health[0].copy(), ALL_STEPS if is_known else 0)
+    return OK
+
+
 _STATES = plan_entry(_states, "mixture_states")
+_SMOOTHED = plan_entry(_smoothed, "mixture_smoother")

@@ -55,7 +55,7 @@ def draw_of_mixture(w, X, n_finite, order, seed, place, out):
     for a in range(n):
         drawn[a] = X[a, part]
     for j in range(n_normal):
-        z = _normal(seed, place, j)
+        z = normal_at(seed, place, 1 + 2 * j)
         for i in range(j, n_normal):
             drawn[n_finite + i] += root[i, j] * z
     for a in range(n):
@@ -63,7 +63,7 @@ def draw_of_mixture(w, X, n_finite, order, seed, place, out):
 
 
 @njit_internal
-def _normal(seed, place, j):
-    """Box and Muller's normal of two uniform numbers of their own."""
-    u, v = uniform_at(seed, STATES, place, 1 + 2 * j), uniform_at(seed, STATES, place, 2 + 2 * j)
+def normal_at(seed, place, first):
+    """Box and Muller's normal of the two uniform numbers from ``first`` on."""
+    u, v = uniform_at(seed, STATES, place, first), uniform_at(seed, STATES, place, first + 1)
     return math.sqrt(-2.0 * math.log(u)) * math.cos(2.0 * math.pi * v)

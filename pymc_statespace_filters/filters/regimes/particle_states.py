@@ -1,20 +1,27 @@
-"""States of a Rao-Blackwellised particle filter, the mixture of its particles."""
+"""States of a Rao-Blackwellised particle filter, the mixture of its particles.
+
+Smoothed states are those of paths drawn back, see `backward_simulation`.
+"""
 
 import numpy as np
 from numba import carray
 
 from ...compiler.native.entry_point import EntryPoint
 from ...compiler.native.jit import copy_into, njit_internal
-from ...compiler.native.plan import HEALTH_SIZE, REQUEST, RESULTS, plan_entry
-from ..calls import OK, first_unknown, opened, reals_at, wanted_rows
+from ...compiler.native.plan import HEALTH_SIZE, RECORD, REQUEST, RESULTS, plan_entry
+from ..calls import ALL_STEPS, OK, first_unknown, opened, reals_at, single_record, wanted_rows
+from ..ensemble.backward_simulation import n_paths_of
 from ..ensemble.callbacks import CALLBACK_ARGUMENTS, run_observed, searchsorted
 from ..ensemble.loop import N_LEADING
-from ..ensemble.summaries import finite_weights
+from ..ensemble.summaries import finite_weights, write_summaries
 from ..ensemble.weights import effective_number
-from ..plan import PLAN, settings_of
+from ..outcomes import NONE
+from ..plan import PLAN, read_system, settings_of
+from .backward_simulation import Mixtures, simulate_backward
 from .moments import draw_of_mixture, mixture_moments
 
-N_SETTINGS = 2  # those of the resampling, in front of the number of finite states and the order
+# Those of the resampling, in front of the numbers of finite states and of draws, and the order.
+N_SETTINGS = 2
 
 # Integers of the callback, then the steps of the rows, then the order of the states.
 _N_HEADER = 14
@@ -74,7 +81,7 @@ def _header(call, order, n_finite):
     integers[_FINITE], integers[_ORDER] = n_finite, order.size
     copy_into(integers[_N_HEADER : _N_HEADER + rows.size], rows)
     for a in range(order.size):
-        integers[_N_HEADER + rows.size + a] = int(order[a])
+        integers[_N_HEADER + rows.size + a] = order[a]
     return integers
 
 
@@ -82,8 +89,14 @@ def _header(call, order, n_finite):
 def _order(call):
     """The number of finite states, and where each state is among these and the others."""
     given = settings_of(call.plan)[N_LEADING + N_SETTINGS :]
-    call.results[RESULTS.n_states] = given.size - 1
-    return np.int64(given[0]), given[1:]
+    call.results[RESULTS.n_states] = given.size - 2
+    return np.int64(given[0]), given[2:].astype(np.int64)
+
+
+@njit_internal
+def _n_draws(plan):
+    """How many draws of the finite variables a step has."""
+    return np.int64(settings_of(plan)[N_LEADING + N_SETTINGS + 1])
 
 
 @njit_internal
@@ -161,8 +174,37 @@ def _forget(row, mean, cov, members, weights):
     _fill(weights[row], np.nan)
 
 
+def _smooth(plan, record, request, results):
+    status, call = opened(plan, record, request, results)
+    if status != OK:
+        return status
+    n_finite, order = _order(call)
+    if call.request[REQUEST.sizes_only]:
+        return status
+    rows, n, N = wanted_rows(call), call.plan[PLAN.n], call.plan[PLAN.n_members]
+    data = single_record(call, 0, 0, call.record[RECORD.n_rows])
+    n_steps = data.steps[-1] if data.steps.size else np.int64(0)
+    integers, stored = np.array([n, N]), np.empty((n_steps + 1) * (n + 1) * N)
+    reals = np.full((3 * order.size + 1) * rows.size, np.nan)
+    status, _, health = run_observed(call, plan, record, integers, stored)
+    is_known = health[1] == NONE
+    if is_known:
+        system = read_system(call.plan, data.theta, data.inputs)
+        mixtures = Mixtures(
+            stored=stored.reshape((n_steps + 1, n + 1, N)), n_finite=n_finite, order=order,
+            moves=call.plan[PLAN.moves], n_draws=_n_draws(call.plan), c=system.c,
+            inputs=system.inputs, t0=data.t0, dt=system.dt,
+        )  # fmt: skip
+        simulate_backward(mixtures, n_paths_of(N), call.request[REQUEST.draw_seed], rows, reals)
+    write_summaries(call, reals, health, ALL_STEPS if is_known else 0)
+    return status
+
+
 STATES_OF_MIXTURE = plan_entry(_states, "rbpf_states")
 """Predicted or filtered states, in one pass."""
 
 RUN_OF_MIXTURE = plan_entry(_run, "rbpf_run")
 """One run that keeps all particles at some steps, with the means of their Kalman filters."""
+
+SMOOTH_MIXTURE = plan_entry(_smooth, "rbpf_smoother")
+"""Smoothed states, by paths drawn back through the particles of all steps."""

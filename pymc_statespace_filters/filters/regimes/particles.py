@@ -52,7 +52,7 @@ class HybridParticles:
     @cached_property
     def condition(self) -> MemberFunction:
         """Condition every particle on an observation; log p(d) of each goes to a row below it."""
-        equations = _Equations(self.hybrid, self.linearization)
+        equations = ParticleEquations(self.hybrid, self.linearization)
         regime, state = equations.parts(equations.particle)
         state, term = equations.updated(equations.values, regime, state)
         outputs = pt.concatenate([regime, state, [term]])
@@ -65,7 +65,7 @@ class HybridParticles:
         The log of the density of the observation given the particle before goes to a row below it.
         ``gains`` are the observation, the inputs at its step, and its time.
         """
-        equations = _Equations(self.hybrid, self.linearization)
+        equations = ParticleEquations(self.hybrid, self.linearization)
         p, n_inputs = self.hybrid.system.p, self.hybrid.system.n_input_columns
         seen = pt.tensor("gains", shape=(p + n_inputs + 1,), dtype="float64")
         later = {"d": seen[:p], "u": seen[p : p + n_inputs], "t": seen[p + n_inputs]}
@@ -92,11 +92,11 @@ class HybridParticles:
 def hybrid_particles(system: StateSpaceModel, linearization: Linearization) -> HybridParticles:
     """The particles of a hybrid system whose Kalman filters have this linearisation."""
     hybrid = hybrid_of(system)
-    model = _Equations(hybrid, linearization).system()
+    model = ParticleEquations(hybrid, linearization).system()
     return HybridParticles(hybrid, compile_system(model), linearization)
 
 
-class _Equations:
+class ParticleEquations:
     """Steps and updates of one particle, as graphs."""
 
     def __init__(self, hybrid: Hybrid, linearization: Linearization) -> None:
@@ -109,7 +109,7 @@ class _Equations:
         given = symbols_of(hybrid.given)
         given["s"] = pt.tensor("s", shape=(state_size(hybrid.n),), dtype="float64")
         by = linearizations_of(hybrid.given, linearization)
-        self._given = given
+        self.given, self.linearizations = given, by
         self._predicted = predict(by.transition, hybrid.given, given)
         self._updated = update(by.observation, hybrid.given, given)
 
@@ -121,18 +121,25 @@ class _Equations:
         self, values: Symbols, regime: TensorVariable, state: TensorVariable, v: TensorVariable
     ) -> TensorVariable:
         """Mean and covariance after a step."""
-        return graph_replace(self._predicted, self._known(values, regime, state, v), strict=False)
+        return graph_replace(self._predicted, self.known(values, regime, state, v), strict=False)
 
     def updated(
         self, values: Symbols, regime: TensorVariable, state: TensorVariable
     ) -> tuple[TensorVariable, TensorVariable]:
         """Mean and covariance given an observation, and its log-density."""
-        known = self._known(values, regime, state)
+        known = self.known(values, regime, state)
         return tuple(graph_replace(list(self._updated), known, strict=False))
 
-    def _known(self, values, regime, state, v=None):
+    def known(
+        self,
+        values: Symbols,
+        regime: TensorVariable,
+        state: TensorVariable,
+        v: TensorVariable | None = None,
+    ) -> dict[TensorVariable, TensorVariable]:
+        """What the symbols of the system of the continuous states are replaced by."""
         named = {**values, "s": state, "u": self.hybrid.inputs(values["u"], regime, v)}
-        return {self._given[name]: named[name] for name in ("theta", "u", "t", "d", "s")}
+        return {self.given[name]: named[name] for name in ("theta", "u", "t", "d", "s")}
 
     def step(self) -> TensorVariable:
         """The particle after a step."""
@@ -143,11 +150,12 @@ class _Equations:
         chosen = self._chosen([part.weight for part in parts], both)
         v, state = chosen[: drawn[0].type.shape[0]], chosen[drawn[0].type.shape[0] :]
         moved = self.predicted(self.values, regime, state, v)
-        return pt.concatenate([self._next_regime(regime, state, v), moved])
+        return pt.concatenate([self.next_regime(regime, state, v), moved])
 
-    def _next_regime(
+    def next_regime(
         self, regime: TensorVariable, state: TensorVariable, v: TensorVariable
     ) -> TensorVariable:
+        """The regime to which values of the finite variables lead."""
         return self.hybrid.step(self.values, regime, state[: self.hybrid.n], v).regime
 
     def moved_to_observation(self, later: Symbols) -> TensorVariable:
@@ -160,7 +168,7 @@ class _Equations:
         drawn = [pt.constant(v) for v in self.hybrid.drawn]
         parts = draws_of(self.hybrid, self.values, regime, state, drawn)
         for v, (weight, given) in zip(drawn, parts, strict=True):
-            regime_after = self._next_regime(regime, given, v)
+            regime_after = self.next_regime(regime, given, v)
             forecast = self.predicted(self.values, regime, given, v)
             analysis, term = self.updated(later, regime_after, forecast)
             weights.append(weight)
