@@ -212,12 +212,86 @@ def test_filtered_and_predicted_states():
             np.testing.assert_allclose(mean[moment][k, 0], expected, rtol=1e-12)
 
 
+# Moves that depend on time, a sensor that depends on inputs and time, and a state at the start to
+# which nothing leads.
+SEASON = psf.StateSpaceModel(
+    transition=lambda x, q: [1.0 + q[0]],
+    process_dist=lambda x, t, swing: [
+        pm.Bernoulli.dist(pm.math.sigmoid(swing * pt.sin(t) + pt.switch(x[0] > 1, 0.7, -0.3)))
+    ],
+    observation=lambda x, u, t, level: [level * x[0] * u[0] + 0.2 * t],
+    observation_noise=[[0.3]],
+    initial_mean=[0.0],
+    initial_cov=[[0.0]],
+    inputs=["gain"],
+    dt=0.5,
+)
+SWINGING = {"swing": 2.0, "level": 0.7}
+SEASONS = {
+    "observed": np.array([0.2, 1.0, 0.3, np.nan, -0.9]),
+    "steps": np.array([0, 1, 3, 4, 6]),
+    "inputs": np.array([1.0, 0.5, -0.3, 0.8, -1.1, 0.4, 1.3]),
+    "t0": 0.9,
+}
+
+
+def season_paths(swing, level, observed, steps, inputs, t0):
+    """All paths of the state, and log p(path, data) of each."""
+    paths = np.array([(0, *path) for path in itertools.product((1, 2), repeat=steps[-1])])
+    t, log_p = t0 + 0.5 * np.arange(steps[-1] + 1), np.zeros(len(paths))
+    for k in range(steps[-1]):
+        up = 1 / (1 + np.exp(-swing * np.sin(t[k]) - np.where(paths[:, k] > 1, 0.7, -0.3)))
+        log_p += np.log(np.where(paths[:, k + 1] == 2, up, 1 - up))
+    for k, d in zip(steps, observed, strict=True):
+        if not np.isnan(d):
+            log_p += norm.logpdf(d, level * paths[:, k] * inputs[k] + 0.2 * t[k], 0.3**0.5)
+    return paths, log_p
+
+
+def season_states(k, last):
+    """The mean of the state at a step given the data until another one."""
+    hidden = np.where(SEASONS["steps"] > last, np.nan, SEASONS["observed"])
+    paths, log_p = season_paths(**SWINGING, **SEASONS | {"observed": hidden})
+    return np.average(paths[:, k], weights=np.exp(log_p))
+
+
+def test_moves_by_time_and_sensors_by_inputs():
+    """Terms, their gradient, and states, where steps are not the numbers of rows."""
+    filter = psf.FiniteStateFilter()
+    terms = psf.log_likelihood(SEASON, filter, SWINGING, **SEASONS)
+    _, log_p = season_paths(**SWINGING, **SEASONS)
+    np.testing.assert_allclose(terms.sum(), np.logaddexp.reduce(log_p), rtol=1e-12)
+    _, slope = gradient(SEASON, filter, SWINGING, SEASONS)
+    expected = by_differences(SEASON, filter, SWINGING, SEASONS)
+    np.testing.assert_allclose(slope, expected, rtol=1e-8, atol=1e-8)
+    for moment, lag in (("predicted", -1), ("filtered", 0), ("smoothed", 6)):
+        mean = states(moment, [0], SEASON, SWINGING, SEASONS)[0][:, 0]
+        exact = [season_states(k, k + lag) for k in range(7)]
+        np.testing.assert_allclose(mean, exact, rtol=1e-12)
+    law = evaluator(Predictions(SEASON, filter))(*arguments_of(SEASON, SWINGING, SEASONS))[0]
+    u, t = SEASONS["inputs"], 0.9 + 0.5 * SEASONS["steps"]
+    exact = [0.7 * u[k] * season_states(k, k - 1) for k in SEASONS["steps"]] + 0.2 * t
+    np.testing.assert_allclose(law[:, 0], exact, rtol=1e-12)
+
+
+def test_draws_at_different_steps_are_independent():
+    """Of filtered states, as they are not a path: five standard errors of their covariances."""
+    _, _, drawn = states("filtered", range(1000))
+    of_regime = drawn[:, [2, 3, 6], 0]
+    covariance = np.cov(of_regime.T)
+    assert (np.diag(covariance) > 0.05).all()
+    assert (abs(covariance[np.triu_indices(3, 1)]) < 5 * 0.25 / 1000**0.5).all()
+
+
 def test_run_shows_the_probability_of_every_state():
     """As particles, which are all joint values, and their weights."""
     run = psf.run_filter(SWITCH, psf.FiniteStateFilter(), GIVEN, at="steps", **RECORD)
     assert run["particles"].isel(time=3).values.tolist() == [[0, 0], [0, 1], [1, 0], [1, 1]]
     np.testing.assert_allclose(run["weights"].sum("particle"), 1.0)
     np.testing.assert_allclose(run["mean"].values, states("filtered", [0])[0], rtol=1e-12)
+    weights, members = run["weights"].values[3], run["particles"].values[3]
+    exact = np.cov(members.T, aweights=weights, bias=True)
+    np.testing.assert_allclose(run["cov"].values[3], exact, atol=1e-12)
 
 
 @pytest.mark.parametrize("at", ["steps", "observations"])

@@ -11,7 +11,7 @@ class SwitchingSystem:
     """x' = A[r'] x + b[r'] + u + w, w ~ N(0, Q[r']), of the regime r' that a step leads to.
 
     Regimes start with the probabilities ``start`` and change by ``P[r, r']``. All regimes have the
-    observation H x + e, e ~ N(0, R), and start from N(mean, cov).
+    observation H x + e, e ~ N(0, R). They start from N(mean, cov), or each from its own.
     """
 
     P: np.ndarray
@@ -26,7 +26,9 @@ class SwitchingSystem:
 
     def paths(self, steps, observed, inputs=None):
         """For every path: its log-probability with the record, last regime, mean and covariance."""
-        before = [(np.log(p), (r,), self.mean, self.cov) for r, p in enumerate(self.start) if p]
+        K, n = len(self.start), self.A.shape[-1]
+        mean, cov = np.broadcast_to(self.mean, (K, n)), np.broadcast_to(self.cov, (K, n, n))
+        before = [(np.log(p), (r,), mean[r], cov[r]) for r, p in enumerate(self.start) if p]
         k = 0
         for step, d in zip(steps, np.reshape(observed, (len(steps), -1)), strict=True):
             while k < step:
