@@ -12,7 +12,10 @@ intercept is 0 and slope 1; z of sum(truth - probability); and how many constant
 probability above 0.95, at most 1 in 19. A record takes about 2 CPU s. A second number is the first
 seed.
 
-FIGURES
+Seeds 1101 to 1146: error / se mean 0.06, rms 1.41, one of 38 at 4.5, twelve further chains of that
+record at 0.9; without doubt is none wrong by more than 0.19 nats. Exact factors alone, seeds 1001
+to 6000: intercept 0.07 (0.04), slope 1.03 (0.04), z 1.3, 6 of 2440 constant ones above 0.95. Seeds
+101 to 288 have intercept -0.59 (0.22) by exact factors, too: fewer records drift than expected.
 """
 
 import logging
