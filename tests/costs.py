@@ -35,6 +35,18 @@ def free_pass_managers():
             manager._dispose = newpassmanagers.NewPassManager._dispose
 
 
+def compiled_on_import():
+    """Fail if the import of a test file has compiled: each process imports all of them."""
+    native = "pymc_statespace_filters.compiler"
+    places = (
+        (f"{native}.native.entry_point", "_compiled"),
+        (f"{native}.codegen.machine_code", "_addresses"),
+    )
+    symbols = [s for module, name in places for s in getattr(sys.modules.get(module), name, ())]
+    if symbols:
+        raise pytest.UsageError(f"importing test files must compile nothing, it did {symbols}")
+
+
 def resident_mb():
     """Memory of this process, if the system tells."""
     if not MEMORY.exists():
@@ -66,6 +78,7 @@ class Costs:
 
         event.register("numba:run_pass", Listener())
         free_pass_managers()
+        compiled_on_import()
         self.before = self.now()
 
     @pytest.hookimpl(wrapper=True)

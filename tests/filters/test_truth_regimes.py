@@ -71,8 +71,8 @@ EXACT = SwitchingSystem(
     mean=np.zeros(1),
     cov=np.eye(1),
 )
-OBSERVED = psf.simulate(SYSTEM, PARAMS, **RECORD, random_seed=4)["observations"].values
-OBSERVED[3] = np.nan
+# Simulated, and a row missing.
+OBSERVED = np.array([0.4908, 0.1974, 1.4435, np.nan, 2.7747, 2.5502, 3.0971])[:, None]
 
 
 def log_likelihood(filter, system=SYSTEM, params=PARAMS, observed=OBSERVED, **others):
