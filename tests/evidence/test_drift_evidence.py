@@ -1,5 +1,6 @@
 """The Bayes factor for drift, against quadrature over the strength."""
 
+from dataclasses import replace
 from functools import cache
 
 import arviz as az
@@ -7,7 +8,7 @@ import numpy as np
 import pymc as pm
 import pytest
 from scipy.integrate import quad
-from scipy.stats import halfnorm, multivariate_normal, uniform
+from scipy.stats import halfnorm, multivariate_normal, norm, uniform
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
@@ -177,13 +178,38 @@ def test_several_strengths_alone_and_together():
         found = exact_draws(observed, *PRIORS["half-normal"], random_seed=i)["posterior"]
         draws |= {f"mu{i}": found["mu"].values, f"s{i}": found["mu_strength"].values}
     idata = az.from_dict({"posterior": draws})
-    table = psf.drift_evidence(idata, model, var_names=["s0", "s1"], **QUIET)
+    prior = {"constant": 3, "drifting": 1}
+    table = psf.drift_evidence(idata, model, var_names=["s0", "s1"], model_prior=prior, **QUIET)
     assert list(table.index)[2] == "s0, s1"
+    assert table["prob"].iloc[0] > table["prob"].iloc[1]  # whatever the order of the names
+    log_odds = table["log_bayes_factor"] - np.log(3)
+    np.testing.assert_allclose(table["prob"], 1 / (1 + np.exp(-log_odds)))
+    assert (table["undecided"] == (abs(log_odds) < norm.ppf(0.975) * table["se"])).all()
+    curves = table.widths["width_prob"].sel(width=1.0)
+    for name in table.index:
+        np.testing.assert_allclose(curves.sel(model=f"drift, {name}"), table.loc[name, "prob"])
     exact = [exact_log_bayes_factor(observed) for observed in records]
     for name, value in zip(["s0", "s1", "s0, s1"], [*exact, sum(exact)], strict=True):
         row = table.loc[name]
         assert row["se"] < 0.07
         assert abs(row["log_bayes_factor"] - value) < 3.5 * row["se"]
+
+
+def test_no_draw_is_weighed_by_what_it_has_taught():
+    """The density w of a half of the chains is fitted to the other half, so that it is given."""
+    model, observed = drifting_model(0.0, 1)
+    idata = exact_draws(observed, *PRIORS["half-normal"], n=(2, 100))
+    posterior, _ = build_posterior(idata, ModelDensity(model))
+    draws = posterior.draws.copy()
+    draws[0, 0] += 0.5
+    constant = ConstantModel(model, ["mu_strength"], moved=False)
+    before, after = (
+        constant.log_terms(one, None, np.random.default_rng(1))
+        for one in (posterior, replace(posterior, draws=draws))
+    )
+    is_same = before == after
+    assert np.argwhere(~is_same[:, :50]).tolist() == [[0, 0]]
+    assert not is_same[:, 50:].any()
 
 
 def test_bounded_variables_without_a_transform_are_not_translated():

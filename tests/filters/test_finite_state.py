@@ -13,6 +13,7 @@ from pymc_statespace_filters.compiler.lowering.compiled_system import compile_sy
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.outcomes import Failure
 from pymc_statespace_filters.filters.recommendation import exact_filter
+from pymc_statespace_filters.filters.signatures import PANEL
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.ops.states import Predictions, States
@@ -367,6 +368,19 @@ def test_failures_are_counted_with_their_row():
         assert (Failure(int(health[1])), health[2]) == (failure, row)
         assert np.isneginf(terms[row:]).all()
         assert np.isfinite(terms[:row]).all()
+
+
+def test_the_row_that_fails_in_a_panel():
+    """Of all rows, behind a record that has a likelihood."""
+    rows = np.column_stack([np.repeat([0, 1], 6), np.tile(COUNTS["steps"], 2), np.zeros(12)])
+    observed = np.tile(COUNTS["observed"], 2)
+    observed[9] = -1.0
+    theta = np.tile(flat_parameters(WEAR, WORN), (2, 1))
+    likelihood = evaluator(LogLikelihood(WEAR, psf.FiniteStateFilter(), PANEL))
+    given = theta, rows.astype(np.int64), observed[:, None], np.zeros((0, 0)), 0.0, 0
+    terms, health = likelihood(*given)
+    assert (Failure(int(health[1])), health[2]) == (Failure.ZERO_DENSITY, 9)
+    np.testing.assert_array_equal(np.isneginf(terms), np.arange(12) >= 9)
 
 
 def test_densities_far_below_that_of_an_impossible_state():

@@ -10,9 +10,12 @@ from scipy.stats import kstest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.parameter_particles import output
+from pymc_statespace_filters.parameter_particles.observed_rows import ObservedRows
+from pymc_statespace_filters.parameter_particles.sequential_run import _variance
 from pymc_statespace_filters.pymc_model.density import ModelDensity
 from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
 from pymc_statespace_filters.smc.merging import merged_log_evidence
+from pymc_statespace_filters.smc.particles import Populations
 from tests.parameter_particles.autoregression import DATA, STEPS, exact, exact_transforms, model
 from tests.systems import FORCED, FREE, pair
 
@@ -99,6 +102,17 @@ def test_members_are_doubled_and_the_stored_estimates_are_theirs(by_filter):
     stats = found["sample_stats"]
     recomputed = ModelDensity(built).evaluate(x, stats["d_seed"].values.reshape(-1, 1))
     np.testing.assert_allclose(stats["lp"].values.ravel(), recomputed, rtol=1e-9)
+
+
+def test_members_are_judged_by_the_variance_at_fixed_parameters():
+    """Not by that over parameters, which is larger."""
+    rows, rng = ObservedRows.of(model(psf.BootstrapPF(50), 5)), np.random.default_rng(1)
+    a = np.linspace(-1.5, 1.5, 8)[:, None]
+    pilot = Populations.of_equal_weights(rows.drawn(8, rng)._replace(x=a), 1)
+    values = rows.estimated(np.repeat(a, 100, axis=0), 5, rng)[0].reshape(8, 100)
+    expected = values.var(axis=1, ddof=1).mean()
+    assert values.mean(axis=1).var(ddof=1) > 4 * expected
+    assert 0.5 < _variance(rows, pilot, 5, rng) / expected < 2  # of 8 times 8 estimates
 
 
 def test_states_and_forecasts_follow_from_the_draws(by_filter):

@@ -19,7 +19,11 @@ from pymc_statespace_filters.pymc_model.step_refinement import (
 from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.input_columns import divided
 from pymc_statespace_filters.system.integrators.substeps import CoupledNoise
-from pymc_statespace_filters.system.own_units import law_in_own_units, moments_of_members
+from pymc_statespace_filters.system.own_units import (
+    law_in_own_units,
+    moments_in_own_units,
+    moments_of_members,
+)
 from pymc_statespace_filters.system.record import checked_record
 from tests.systems import DOUBLE_WELL_SYSTEM, PAIR, PAIR_DATA, STEPS, log_likelihoods
 
@@ -334,12 +338,31 @@ def test_laws_in_own_units_are_those_of_draws():
     np.testing.assert_allclose(found_mean[1], one, rtol=1e-12)
     np.testing.assert_allclose(found[0, 1], cov[0, 1] * one, rtol=1e-10)  # Stein's lemma
     np.testing.assert_allclose(found[1, 1], one**2 * np.expm1(sd[1] ** 2), rtol=1e-10)
+    for i, alone in enumerate(moments_in_own_units(system, mean, sd)):
+        np.testing.assert_allclose(alone, [found_mean, np.sqrt(np.diagonal(found))][i], rtol=1e-9)
     draws = mean + np.random.default_rng(0).normal(size=(400_000, 3)) @ root.T
     draws[:, 1], draws[:, 2] = np.exp(draws[:, 1]), -1 + 4 / (1 + np.exp(-draws[:, 2]))
     weights = np.full((1, len(draws)), 1 / len(draws))
     (drawn_mean,), (drawn,) = moments_of_members(draws[None], weights)
     np.testing.assert_allclose(found_mean, drawn_mean, atol=0.01)  # four standard errors or more
     np.testing.assert_allclose(found, drawn, atol=0.015)
+
+
+def test_moments_of_few_members_are_unbiased():
+    members, w = np.array([[0.0, 1.0], [2.0, 0.0], [3.0, 5.0]]), np.array([0.5, 0.3, 0.2])
+    (mean,), (cov,) = moments_of_members(members[None], w[None])
+    np.testing.assert_allclose(mean, w @ members)
+    expected = np.cov(members.T, aweights=w, bias=True) / (1 - (w**2).sum())
+    np.testing.assert_allclose(cov, expected)
+
+
+def test_a_start_between_bounds_is_where_it_was():
+    system = psf.drifting(pushed(), gain=psf.RandomWalk(scale=("logit", -1, 3)))
+    still = PARAMS | {"gain_strength": 0.0}
+    record = {"observed": DATA, "steps": GRID, "inputs": PUSH}
+    found = psf.log_likelihood(system, psf.EKF(), still, **record)
+    constant = psf.log_likelihood(pushed(), psf.EKF(), PARAMS, **record)
+    np.testing.assert_allclose(found, constant, rtol=0, atol=1e-12)
 
 
 def test_a_start_outside_the_scale_is_named():
