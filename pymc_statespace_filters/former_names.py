@@ -1,16 +1,16 @@
-"""Former names of arguments: an error that says what is used now."""
+"""Other names of arguments, former ones or those of relatives: an error says what is used."""
 
 from collections.abc import Callable
 from functools import wraps
 
 
 def former_names[**P, R](**instead: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Refuse arguments that a function once had, each with the text that says what to do instead.
+    """Refuse arguments that a function has not, each with the text that says what to do instead.
 
     Raises
     ------
     TypeError
-        By the function returned, if it is called with a former name.
+        By the function returned, if it is called with such a name.
 
     Examples
     --------
@@ -19,7 +19,7 @@ def former_names[**P, R](**instead: str) -> Callable[[Callable[P, R]], Callable[
     ...     return color
     >>> paint(colour="red")
     Traceback (most recent call last):
-    TypeError: paint() has no argument 'colour' any more: use color
+    TypeError: paint() has no argument 'colour': use color
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
@@ -28,7 +28,7 @@ def former_names[**P, R](**instead: str) -> Callable[[Callable[P, R]], Callable[
             for name in kwargs:
                 if name in instead:
                     raise TypeError(
-                        f"{function.__name__}() has no argument {name!r} any more: {instead[name]}"
+                        f"{function.__name__}() has no argument {name!r}: {instead[name]}"
                     )
             return function(*args, **kwargs)
 

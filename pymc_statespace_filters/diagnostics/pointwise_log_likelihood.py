@@ -1,14 +1,12 @@
 """Sequential log-likelihood terms at every draw, each with the noise of its own estimate."""
 
-import warnings
-from collections.abc import Sequence
-
 import numpy as np
 import pymc as pm
 import xarray as xr
 
-from ..errors import EvidenceWarning, ModelError
+from ..errors import ModelError
 from ..pymc_model.other_filter import model_of_draws
+from ..pymc_model.sequential_terms import warn_of_sequence
 from ..pymc_model.state_graphs import StateSpaceVariable, terms_of
 from ..states.draws import PosteriorDraws, select_draws
 from ..states.groups import add_group, coords_of_steps
@@ -40,8 +38,9 @@ def compute_log_likelihood(
     The terms :math:`\log p(d_j \mid d_1 \dots d_{j-1}, \theta)` are **sequential**: each is
     conditional on all earlier observations. `leave_future_out` uses them. ``az.loo``, and with it
     ``az.compare`` of DataTrees, is invalid with them, because the terms of later observations
-    depend on the observation that is left out. ArviZ does not warn; this function does, and
-    ``elpd_i`` of a pointwise result has the attribute ``terms``, which says so.
+    depend on the observation that is left out. ArviZ does not warn; this function and
+    ``pm.compute_log_likelihood`` do, and ``elpd_i`` of a pointwise result has the attribute
+    ``terms``, which says so.
 
     The terms of a **panel** are summed by record. With these sums ``az.loo`` leaves out whole
     records, and is valid: records are independent given the parameters. Records with parameters of
@@ -106,7 +105,8 @@ def compute_log_likelihood(
     """
     model = model_of_draws(model, idata)
     draws, variables = select_draws(idata, None), select_variables(model, var_name)
-    _warn_of_sequence([one.name for one in variables if not one.is_panel])
+    if names := [repr(one.name) for one in variables if not one.is_panel]:
+        warn_of_sequence(", ".join(names))
     found = xr.merge(
         [
             (_terms_of_records if variable.is_panel else sequential_terms)(
@@ -119,18 +119,6 @@ def compute_log_likelihood(
         present = idata["log_likelihood"].to_dataset()
         found = found.merge(present[[name for name in present.data_vars if name not in found]])
     return add_group(idata, "log_likelihood", found, {}, extend_inferencedata)
-
-
-def _warn_of_sequence(names: Sequence[str]) -> None:
-    if names:
-        warnings.warn(
-            f"the terms of {', '.join(map(repr, names))} are conditional on the earlier "
-            "observations: az.loo and az.compare of them are no leave-one-out cross-validation. "
-            "Compare scores psf.leave_future_out(idata, model, min_observations=..., refit=lambda "
-            "model: psf.sample_dram(model=model))",
-            EvidenceWarning,
-            stacklevel=3,
-        )
 
 
 def sequential_terms(

@@ -153,7 +153,7 @@ def run_filter(
     common = attributes(system, filter, [each[0] for each in arguments], noise, arguments[0][4])
     axes = [table.axis] if isinstance(table, CheckedRecord) else table.axes
     ends = [float(axis.times(axis.steps[-1])) for axis in axes]
-    clock = {"unit": table.clock.unit or 0, "origins": list(table.clock.origins), "ends": ends}
+    clock = table.clock.stored() | {"ends": ends}
     first = [np.int64(0)] * len(arguments)
     before = [np.empty(0)] * len(arguments)
     if state is not None:
@@ -195,8 +195,8 @@ def _earlier(system: StateSpaceModel, state: Any) -> tuple[StateSpaceModel, Earl
     """The system of an earlier run, on a grid or not, and where its records go on."""
     if not isinstance(state, xr.Dataset) or STATE not in state:
         return system, None  # refused later, with the reason
-    attrs = {"unit": 0, "origins": [], "ends": [], "t0": 0.0} | state.attrs
-    clock = Clock(int(attrs["unit"]) or None, tuple(map(int, np.atleast_1d(attrs["origins"]))))
+    attrs = Clock().stored() | {"ends": [], "t0": 0.0} | state.attrs
+    clock = Clock.restored(attrs)
     steps = [int(one[0]) if np.isfinite(one[0]) else 0 for one in np.atleast_2d(state[STATE])]
     ends = list(map(float, np.atleast_1d(attrs["ends"])))
     is_same = attrs["system"] == system.fingerprint

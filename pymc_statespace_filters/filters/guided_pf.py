@@ -7,7 +7,7 @@ particles that stay unguided where the guide is in doubt, and `ensemble.pilot` f
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -200,6 +200,7 @@ class GuidedPF(ParticleFilter):
     resumes: ClassVar[bool] = False
     needs_record_ahead: ClassVar[bool] = True
     entry: ClassVar[EntryPoint] = likelihood_entry("guided_pf", _evaluate, needs=(FILL_NORMALS,))
+    _: KW_ONLY
     resample_below: float = 0.5
 
     def check(self, system: System) -> None:

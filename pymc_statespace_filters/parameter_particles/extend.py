@@ -10,8 +10,8 @@ from ..compiler.native.compilation import COMPILATION
 from ..errors import DataMismatchError, ModelError
 from ..pymc_model.filter_rows import Record
 from ..pymc_model.inspection import given_model
-from ..system.checks import check_flag, check_random_seed, shortened
-from ..system.clock import Clock, has_zone, times_of_data
+from ..system.checks import check_flag, check_random_seed
+from ..system.clock import times_of_data
 from ..system.given_record import GivenRecord
 from ..system.input_columns import inputs_of_user
 from ..system.placement import Earlier
@@ -136,8 +136,6 @@ def _new_rows(
     seen = rows.record.steps if steps is not None else rows.seen_times
     name, given = ("steps", check_steps(steps)) if steps is not None else ("times", times)
     at = given if steps is not None else clock.numbers("times", times)
-    if times is not None and clock.unit is not None:
-        _check_zone(clock, times)
     values = check_observed(observed, system, len(at))
     tolerance = 0.0 if steps is not None else GRID_TOLERANCE * system.dt
     n_old = int((at <= seen[-1] + tolerance).sum())
@@ -156,16 +154,6 @@ def _new_rows(
             "psf.nearest_steps, or run sample_smc over all rows"
         )
     return found
-
-
-def _check_zone(clock: Clock, times: Any) -> None:
-    """Raise unless dates have a time zone if those of the run have one, and none otherwise."""
-    if has_zone("times", times) != clock.zoned:
-        remedy = ".tz_localize(zone)" if clock.zoned else '.tz_convert("UTC").tz_localize(None)'
-        raise ModelError(
-            f"times must have {'a' if clock.zoned else 'no'} time zone, as those of the run: write "
-            f"{remedy}, got {shortened(times)}"
-        )
 
 
 def _check_agree(

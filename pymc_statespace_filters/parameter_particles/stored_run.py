@@ -53,7 +53,7 @@ def stored(progress: Progress, request: Request) -> xr.Dataset | None:
     }
     attrs = {
         "model": identity,
-        **_stored_clock(progress.rows.variable.clock),
+        **progress.rows.variable.clock.stored(),
         "entropy": json.dumps(request.entropy),
         "draws": request.draws,
         "waste_free": int(request.size.waste_free),
@@ -96,7 +96,8 @@ def restored(idata: xr.DataTree, model: pm.Model) -> tuple[Progress, Request]:
         rows = rows.of_size(int(attrs["n_members"]))
     pilot, others = (_populations(state, prefix) for prefix in _POPULATIONS)
     cloud = Cloud(pilot, others, float(attrs["scale"]))
-    rows = rows.with_clock(_clock(attrs)).with_record(_record(state, rows))
+    # The dates of a run count from its own origin, whatever the record of a later model.
+    rows = rows.with_clock(Clock.restored(attrs)).with_record(_record(state, rows))
     return Progress(rows, cloud, _courses(idata[COURSE].to_dataset())), request
 
 
@@ -116,16 +117,6 @@ def _record(state: xr.Dataset, rows: ObservedRows) -> Record:
         inputs = state["record_inputs"].values
     steps, observed = state["record_steps"].values, state["record_observed"].values
     return Record(steps, observed, inputs, np.asarray(state["record_t0"].values))
-
-
-def _stored_clock(clock: Clock) -> dict[str, Any]:
-    """The dates of a run count from its own origin, whatever the record of a later model."""
-    return {"unit": clock.unit or 0, "origins": list(clock.origins), "zoned": int(clock.zoned)}
-
-
-def _clock(attrs: dict[str, Any]) -> Clock:
-    origins = tuple(map(int, np.atleast_1d(attrs["origins"])))
-    return Clock(int(attrs["unit"]) or None, origins, bool(attrs["zoned"]))
 
 
 def _courses(course: xr.Dataset) -> list[RowCourse]:

@@ -11,6 +11,7 @@ from arviz_plots.visuals import hline
 
 from ..diagnostics.constancy.table import DriftScan
 from ..errors import ModelError
+from ..former_names import former_names
 from .canvas import add_legend, band, curve, interval, label_axes, legend_style, time_label
 from .marks import canvas_over_time, points
 from .results import select_names
@@ -22,6 +23,7 @@ TURN = {"color": "C1", "diameter": 6}
 MOST_PANELS = 12
 
 
+@former_names(records="give record=, the label of one")
 def plot_drift(
     scan: pd.DataFrame,
     *,

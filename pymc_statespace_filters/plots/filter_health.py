@@ -16,6 +16,7 @@ from arviz_stats.ecdf_utils import (
 )
 from scipy.stats import norm
 
+from ..former_names import former_names
 from .canvas import (
     PANELS_IN_LINE,
     add_legend,
@@ -45,6 +46,7 @@ CUT = {"color": "C1"}
 LIMIT = {"color": "B1", "linestyle": "C1"}
 
 
+@former_names(records="give record=, the label of one")
 def plot_filter_health(
     idata: xr.DataTree,
     *,

@@ -9,6 +9,7 @@ from arviz_plots import PlotCollection
 from arviz_plots.visuals import vline
 
 from ..errors import ModelError
+from ..former_names import former_names
 from ..system.checks import check_count
 from .canvas import add_legend, label_axes, legend_style, time_label
 from .marks import (
@@ -35,6 +36,7 @@ GROUPS = ("predictions", "free_run")
 END = {"color": "B2", "linestyle": "C1"}
 
 
+@former_names(record="give records=, a label or several")
 def plot_forecast(
     idata: xr.DataTree,
     *,

@@ -9,6 +9,7 @@ from arviz_plots import PlotCollection
 from arviz_plots.visuals import labelled_x, labelled_y, line_xy
 
 from ..errors import ModelError
+from ..former_names import former_names
 from ..system.checks import check_count
 from .canvas import add_legend, canvas, unit_of, with_unit
 from .marks import DOTS, PATHS, TRUTH, over_draws, path_xy, points_xy, thin_draws
@@ -16,6 +17,7 @@ from .panels import one_record
 from .results import SAMPLE_DIMS, name_of_states, select_names, states_of, truth_of
 
 
+@former_names(records="give record=, the label of one")
 def plot_phase(
     idata: xr.DataTree,
     x: str | xr.DataArray,

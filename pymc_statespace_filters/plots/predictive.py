@@ -7,11 +7,13 @@ import pymc as pm
 import xarray as xr
 from arviz_plots import PlotCollection
 
+from ..former_names import former_names
 from .forecast import plot_forecast, predicted
 from .panels import with_rows_of_panel
 from .results import group_of, variable_of
 
 
+@former_names(record="give records=, a label or several")
 def plot_predictive(
     idata: xr.DataTree,
     *,

@@ -11,6 +11,7 @@ from arviz_plots.visuals import hline, labelled_title, labelled_x, labelled_y
 
 from ..diagnostics.calibration import standardised
 from ..errors import ModelError
+from ..former_names import former_names
 from .canvas import (
     add_legend,
     band,
@@ -35,6 +36,7 @@ WIDTH, WIDTH_ALONE, HEIGHT = 4.2, 7.0, 2.6  # inches of a column, of a single on
 N_TICKS = 4  # of the axis of predictions
 
 
+@former_names(records="give record=, the label of one")
 def plot_residuals(
     idata: xr.DataTree,
     *,

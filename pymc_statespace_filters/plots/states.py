@@ -7,6 +7,7 @@ import xarray as xr
 from arviz_plots import PlotCollection
 
 from ..errors import ModelError
+from ..former_names import former_names
 from ..system.checks import check_count
 from .canvas import add_legend, curve, label_axes, time_label
 from .finite import draw_ribbons, is_continuous, ribbons
@@ -44,6 +45,7 @@ from .results import (
 PATH = {**DRAWS, "width": 1.5}
 
 
+@former_names(record="give records=, a label or several")
 def plot_states(
     idata: xr.DataTree | xr.Dataset,
     *,

@@ -241,7 +241,8 @@ def _likelihood_of_panel(
     """From a row of parameters for each record to the terms of its rows."""
     if op.form != PANEL or inputs[0] is None or inputs[0].axis != 0 or any(inputs[1:]):
         return None
-    return Aligned(0, tuple(records_of_rows(node.inputs[1]).tolist()))
+    records = np.asarray(inputs[0].records)
+    return Aligned(0, tuple(records[records_of_rows(node.inputs[1])].tolist()))
 
 
 def records_of_rows(rows: Variable) -> np.ndarray:

@@ -23,6 +23,7 @@ from ..system.panel_records import FIRST_INPUT, RECORD, STEP
 from .held_seed import warn_of_held_seed
 from .inspection import state_space_nodes
 from .random_variable import PanelRV, StateSpaceRV, draw_in_python
+from .sequential_terms import warn_of_stored_terms
 from .stepped import warn_of_steps
 from .unused_priors import warn_of_unused_priors
 
@@ -101,6 +102,7 @@ def _draw_in_numba(op: StateSpaceRV, node: Any) -> tuple:
 def _warn_about_model(op: StateSpaceRV) -> None:
     """Warn of what may be wrong, where the log-density of the model in context is asked for."""
     warn_of_held_seed(op.filter)
+    warn_of_stored_terms(is_panel=isinstance(op, PanelRV))
     model = pm.Model.get_context(error_if_none=False)
     if model is not None and op in [node.op for node in state_space_nodes(model).values()]:
         warn_of_unused_priors(model)

@@ -25,6 +25,7 @@ from ..system.record import check_seed, symbolic_record
 from ..system.timed_inputs import TimedInputs
 from . import dispatch as dispatch  # registers draw and density
 from .random_variable import NUMBERS, PanelRV, StateSpaceRV, make_seed
+from .record_dimensions import in_order_of_records
 
 
 class StateSpace(Continuous):
@@ -56,7 +57,8 @@ class StateSpace(Continuous):
         For many records of one system: the label of the record of each row. The rows of a record
         are together, its steps increase, and it starts at step 0 and ``t0``. Parameters are then
         scalars, which all G records share, or have a leading dimension G, in the order of the
-        records' rows (a declared parameter's own shape comes last). See `panel_from`.
+        records' rows (a declared parameter's own shape comes last); a variable of the model whose
+        first dimension has the labels as coordinates is aligned with them. See `panel_from`.
     observed : array_like, shape (J, p) or (J,), optional
         The data; columns of a DataFrame or DataArray are aligned with the system's observables by
         name. NaN marks a missing component and is never imputed; a wholly missing row has the
@@ -169,6 +171,7 @@ class StateSpace(Continuous):
             row_coords: Any = record.clock.shown(record.axis.times(record.axis.steps))
         else:
             record = symbolic_panel(system, given)
+            values = {key: in_order_of_records(key, v, model, record) for key, v in values.items()}
             theta = symbolic_panel_parameters(system, values, record, others)
             n_rows, t0 = int(np.diff(record.records.starts).max()), record.t0
             row_dim, component_dim = _dims(dims, f"{full_name}_obs")

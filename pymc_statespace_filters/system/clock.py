@@ -11,6 +11,9 @@ import pandas as pd
 from ..errors import ModelError
 from .checks import check_finite, check_floats, shortened
 
+# Only these: pandas takes the months "MS" for milliseconds, and "m" for minutes.
+_UNITS = ("W", "D", "h", "min", "s", "ms", "us", "ns")
+
 
 @dataclass(frozen=True)
 class Clock:
@@ -24,6 +27,16 @@ class Clock:
     unit: int | None = None
     origins: tuple[int, ...] = ()
     zoned: bool = False
+
+    def stored(self) -> dict[str, Any]:
+        """The clock as attributes of a stored result, see `restored`."""
+        return {"unit": self.unit or 0, "origins": list(self.origins), "zoned": int(self.zoned)}
+
+    @classmethod
+    def restored(cls, attrs: Mapping[str, Any]) -> "Clock":
+        """The clock of a stored result."""
+        origins = tuple(map(int, np.atleast_1d(attrs["origins"])))
+        return cls(int(attrs["unit"]) or None, origins, bool(attrs["zoned"]))
 
     def shown(self, times: Any, record: int = 0) -> Any:
         """The user's times: numbers, or dates (datetime64, UTC), rounded to 1e-9 of a unit."""
@@ -42,7 +55,8 @@ class Clock:
         if not are_dates(times):
             if self.unit is not None:
                 raise ModelError(
-                    f"{name} must be dates, as those of the model are, got {shortened(times)}"
+                    f"{name} must be dates, as those of the model are (read text with "
+                    f"pd.to_datetime), got {shortened(times)}"
                 )
             return numbers_of_time(name, times)
         if self.unit is None:
@@ -50,8 +64,22 @@ class Clock:
                 f"{name} must be numbers in the unit of dt, as those of the model are, got dates: "
                 f"{shortened(times)}"
             )
+        self._check_zone(name, times)
         origin = self.origins[record if len(self.origins) > 1 else 0]
         return _since(origin, _nanoseconds(name, times), self.unit)
+
+    def _check_zone(self, name: str, times: Any) -> None:
+        """Raise unless dates have a time zone as those of the model have one."""
+        if has_zone(name, times) != self.zoned:
+            remedy = (
+                '.tz_localize(zone), or .tz_localize("UTC") for dates of results'
+                if self.zoned
+                else '.tz_convert("UTC").tz_localize(None)'
+            )
+            raise ModelError(
+                f"{name} must have {'a' if self.zoned else 'no'} time zone, as the dates of the "
+                f"model: write {remedy}, got {shortened(times)}"
+            )
 
 
 def clock_and_start(
@@ -60,6 +88,8 @@ def clock_and_start(
     """The clock of some records, given the times of each or None, and the model time of step 0."""
     if times is None or not are_dates(times[0]):
         if unit is not None:
+            if times is not None:
+                numbers_of_time(name, times[0])  # text and durations have advice of their own
             raise ModelError(
                 f"unit must be None where {name} are not dates, got {unit!r}: numbers are in the "
                 "unit of dt"
@@ -84,23 +114,25 @@ def clock_and_start(
 
 
 def unit_of(unit: Any) -> int:
-    """A duration in nanoseconds: a unit of pandas ("D", "h", "s"), or a Timedelta."""
-    try:
-        found = pd.Timedelta(1, unit=unit) if isinstance(unit, str) else pd.Timedelta(unit)
-        length = found.as_unit("ns").value
-    except (TypeError, ValueError, OverflowError):
-        length = 0
-    if isinstance(unit, bool | int | float) or length <= 0:
+    """A duration in nanoseconds: one of `_UNITS`, or a Timedelta."""
+    length = 0
+    if unit in _UNITS if isinstance(unit, str) else not isinstance(unit, bool | int | float):
+        try:
+            found = pd.Timedelta(1, unit=unit) if isinstance(unit, str) else pd.Timedelta(unit)
+            length = found.as_unit("ns").value
+        except (TypeError, ValueError, OverflowError):
+            pass
+    if length <= 0:
         raise ModelError(
-            'unit must be a duration: "D", "h", "min", "s", "ms", "us" or a pandas.Timedelta '
-            f"(a year is pd.Timedelta(days=365.25)), got {unit!r}"
+            f"unit must be a duration: {', '.join(map(repr, _UNITS))} or a pandas.Timedelta (a "
+            f"year is pd.Timedelta(days=365.25); months differ in length), got {unit!r}"
         )
     return int(length)
 
 
 def unit_text(unit: int) -> str:
     """The unit of some nanoseconds as a user writes it, see `unit_of`."""
-    names = (name for name in ("D", "h", "min", "s", "ms", "us") if unit_of(name) == unit)
+    names = (name for name in _UNITS if unit_of(name) == unit)
     found = next(names, None)
     return f'"{found}"' if found else f"pd.Timedelta('{pd.Timedelta(unit, unit='ns')}')"
 
@@ -131,7 +163,7 @@ def times_of_data(observed: Any) -> Any:
 
 def has_zone(name: str, dates: Any) -> bool:
     """Whether dates have a time zone."""
-    return _index(name, dates).tz is not None
+    return date_index(name, dates).tz is not None
 
 
 def check_zones(dates: Mapping[str, Any]) -> None:
@@ -172,14 +204,15 @@ def _since(origin: int, dates: np.ndarray, unit: int) -> np.ndarray:
 
 def _nanoseconds(name: str, dates: Any) -> np.ndarray:
     """Dates as nanoseconds since 1970; with a time zone, in UTC."""
-    index = _index(name, dates)
+    index = date_index(name, dates)
     if (missing := np.flatnonzero(index.isna())).size:
         raise ModelError(f"{name} must hold a date in every row, got none in row {missing[0]}")
     index = index if index.tz is None else index.tz_convert("UTC").tz_localize(None)
     return np.asarray(index.asi8)
 
 
-def _index(name: str, dates: Any) -> pd.DatetimeIndex:
+def date_index(name: str, dates: Any) -> pd.DatetimeIndex:
+    """Dates as an index of pandas."""
     dates = [dates] if np.ndim(dates) == 0 else dates
     try:
         return pd.DatetimeIndex(np.asarray(dates) if hasattr(dates, "dims") else dates).as_unit(

@@ -11,7 +11,7 @@ from pytensor.graph.basic import Variable
 
 from ..errors import ModelError
 from .checks import shortened
-from .clock import Clock, are_dates, times_of_data
+from .clock import Clock, are_dates, date_index, times_of_data
 from .model import StateSpaceModel
 from .panel_records import Records
 from .placement import Earlier, Placement, Timing, place
@@ -57,26 +57,50 @@ class GivenRecord:
                 raise ModelError("inputs must be numbers where input_times are given, got a symbol")
         timing = Timing(
             _by_record("steps", self.steps, records),
-            _by_record("times", self._own_times(), records),
+            _by_record("times", self._own_times(records), records),
             self.t0, self.unit, inputs, input_times, self.inputs_at, earlier,
         )  # fmt: skip
         return (
             place(system, timing) if records is None else place(system, timing, records.check_each)
         )
 
-    def _own_times(self) -> Any:
+    def _own_times(self, records: Records | None) -> Any:
         """The times that are given, else the dates that the data bring."""
-        if self.steps is not None or self.times is not None:
-            return self.times
         found = times_of_data(self.observed)
+        if self.steps is not None or self.times is not None:
+            if found is not None:
+                _check_agree(self.times, found, records)
+            return self.times
         if found is None and isinstance(self.observed, pd.Series | pd.DataFrame):
             raise ModelError(
                 "observed brings no dates: give steps or times, or dates as its index (read text "
-                f"with pd.to_datetime), got the index {shortened(self.observed.index)}"
+                "with pd.to_datetime, write index.to_timestamp() for periods), got the index "
+                f"{shortened(self.observed.index)}"
             )
         if found is None and self.observed is not None:
             raise ModelError("observed brings no dates: give steps or times")
         return found
+
+
+def _check_agree(times: Any, dates: Any, records: Records | None) -> None:
+    """Raise unless the dates of the data are the times that are given, or increase beside numbers.
+
+    Data whose rows are in another order would be taken by position.
+    """
+    remedy = "leave out times, or give observed without dates (.to_numpy())"
+    if times is not None and are_dates(times) and np.shape(times) == np.shape(dates):
+        given, own = date_index("times", times), date_index("observed", dates)
+        if (other := np.flatnonzero(given != own)).size:
+            at = int(other[0])
+            raise ModelError(
+                f"times must be the dates of observed, got times[{at}] = {given[at]}, where "
+                f"observed has {own[at]}: {remedy}"
+            )
+    for rows in [slice(None)] if records is None else records.slices():
+        if not pd.Index(dates[rows]).is_monotonic_increasing:
+            raise ModelError(
+                "the dates of observed must increase, as steps and times do: sort its rows"
+            )
 
 
 def _by_record(name: str, values: Any, records: Records | None) -> list[Any] | None:

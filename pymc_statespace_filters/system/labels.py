@@ -49,13 +49,18 @@ def rows_in_order(name: str, value: Any, labels: Sequence[Any]) -> Any:
         found = value[value.dims[0]].values.tolist()
     else:
         return value
+    return np.asarray(value)[positions_of(name, found, labels)]
+
+
+def positions_of(name: str, found: Sequence[Any], labels: Sequence[Any]) -> list[int]:
+    """Where in values for the labels ``found`` that of each record is."""
+    positions = {str(label): i for i, label in enumerate(found)}
     if sorted(map(str, found)) != sorted(map(str, labels)):
         raise ModelError(
             f"{name} must have a value for each record, {shortened(list(labels))}, got values for "
-            f"{shortened(found)}"
+            f"{shortened(list(found))}"
         )
-    positions = {str(label): i for i, label in enumerate(found)}
-    return np.asarray(value)[[positions[str(label)] for label in labels]]
+    return [positions[str(label)] for label in labels]
 
 
 def _with_columns_last(value: xr.DataArray, components: Sequence[str], dim: str) -> xr.DataArray:

@@ -87,9 +87,14 @@ def panel_from(
         raise ModelError("frame must have at least one row and one column of values, got none")
     numbers = pd.factorize(frame[record])[0]
     if (numbers < 0).any():
-        row = frame.index[int(np.argmax(numbers < 0))]
+        row = frame.index.tolist()[int(np.argmax(numbers < 0))]
         raise ModelError(f"every row of frame must have a record, got none in row {row!r}")
     observed, has_dates = _floats(frame, columns), are_dates(frame[time])
+    if not has_dates and not pd.api.types.is_numeric_dtype(frame[time]):
+        raise ModelError(
+            f"column {time!r} of frame must hold numbers or dates (read text with pd.to_datetime), "
+            f"got {frame[time].dtype}"
+        )
     times = frame[time] if has_dates else pd.Series(_floats(frame, [time])[:, 0])
     order = np.lexsort([times.to_numpy(), numbers])
     labels, data = np.asarray(frame[record])[order], observed[order]
@@ -117,7 +122,7 @@ def panel_from(
 
 def _times(frame: pd.DataFrame, rows: np.ndarray, times: pd.Series, label: Any) -> pd.Series:
     if times.isna().any():
-        row = frame.index[rows[int(np.argmax(times.isna()))]]
+        row = frame.index.tolist()[rows[int(np.argmax(times.isna()))]]
         raise ModelError(
             f"record {label!r} of frame must have a time in every row, got none in row {row!r}"
         )
@@ -136,7 +141,7 @@ def _steps(
     try:
         return nearest_steps(times, dt, t0=t0, unit=unit)
     except ModelError as error:
-        first = shortened([frame.index[row] for row in rows])
+        first = shortened(frame.index[rows].tolist())
         raise ModelError(f"record {label!r}, rows {first} of frame: {error}") from None
 
 

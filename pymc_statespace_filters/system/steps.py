@@ -58,7 +58,7 @@ def nearest_steps(times: Any, dt: float, *, t0: Any = 0.0, unit: Any = None) -> 
         first, second = (f"{time:g}" if clock.unit is None else time for time in pair)
         raise ModelError(
             f"times must fall on different steps of dt = {dt:g}, got {first} and {second}: "
-            "take a smaller dt, or merge the two observations"
+            "take a smaller dt, merge the two, or give an integrator its times as they are"
         )
     return check_steps(steps.astype("int64"))
 

@@ -170,6 +170,7 @@ def test_categories_texts_and_nullable_columns_are_labels_and_values():
             {"hours": [2.0, -1.0, 0.0, 2.0, 1.0]},
             r"record 3, rows \['q', 's'\] of frame: steps must",
         ),
+        ({"hours": list("abcde")}, "column 'hours' .* numbers or dates .*pd.to_datetime"),
         ({"u": list("abcde")}, "column 'u' of frame must hold numbers, got (str|object)"),
         ({"site": [0.5, 1.0, 0.5, 1.0, 1.0]}, "panel must hold integers or texts, got 0.5"),
     ],

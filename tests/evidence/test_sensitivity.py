@@ -153,7 +153,7 @@ class TestWhatIsRefused:
         ("name", "instead"), [("prior", "give model_prior="), ("exponents", "a model_prior for")]
     )
     def test_former_names(self, name, instead):
-        with pytest.raises(TypeError, match=rf"'{name}' any more: .*{instead}"):
+        with pytest.raises(TypeError, match=rf"'{name}': .*{instead}"):
             curves_of({"line": Rival(2, 1)}, **{name: None})
 
 

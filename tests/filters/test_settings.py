@@ -87,3 +87,9 @@ def test_wrong_settings_are_named_with_their_values(make, argument, value, messa
 def test_a_number_beyond_memory_is_refused():
     with pytest.raises(psf.errors.ModelError, match=r"n_particles .*to 1e.08"):
         psf.BootstrapPF(10**30)
+
+
+@pytest.mark.parametrize("filter", [*PARTICLE_FILTERS, psf.RBPF])
+def test_only_the_number_of_particles_is_given_by_position(filter):
+    with pytest.raises(TypeError, match="positional argument"):
+        filter(10, 0.5)

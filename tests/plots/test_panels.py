@@ -237,3 +237,11 @@ def test_replicated_observations_of_one_record(forecast_of_past):
     assert "end" not in collection.viz.children
     with pytest.raises(ModelError, match="idata has no group 'prior_predictive'"):
         plot_predictive(forecast_of_past, group="prior_predictive")
+
+
+@pytest.mark.parametrize("plot", [plot_states, plot_forecast])
+def test_one_word_for_one_record_and_one_for_several(plot):
+    with pytest.raises(TypeError, match="has no argument 'record': give records="):
+        plot(None, record="A")
+    with pytest.raises(TypeError, match="has no argument 'records': give record="):
+        plot_phase(None, "x", "y", records=["A"])

@@ -234,6 +234,7 @@ def test_predictions_over_another_horizon(exchangeable):
 # Sampling.
 
 
+@pytest.mark.filterwarnings("ignore:the terms of a StateSpace variable")
 def test_nuts_runs_on_the_extended_kalman_filter():
     with pair_model() as model:
         idata = pm.sample(nuts_sampler="pymc", **SHORT)

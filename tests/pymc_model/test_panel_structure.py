@@ -99,6 +99,11 @@ def mixture():
     panel(rate=0.3, level=pm.Mixture("x", weights, components, dims="machine"))
 
 
+def other_order():
+    """The rows of the variable are the records in another order."""
+    panel(rate=0.3, level=pm.Normal("x", shape=3)[np.array([2, 0, 1])])
+
+
 def as_data():
     """The labels are data that may be replaced later."""
     labels = pm.Data("labels", np.repeat([4, 7, 9], N_ROWS))
@@ -126,6 +131,7 @@ FORMS = {  # own, population, shared
     two_panels: (["x"], [], []),
     summed_potential: (["x"], [], []),
     mixture: (["x"], ["weights"], []),
+    other_order: (["x"], [], []),
     as_data: (["x"], [], []),
 }
 

@@ -346,6 +346,7 @@ def state_space():
     return model, tree
 
 
+@pytest.mark.filterwarnings("ignore:the terms of a StateSpace variable")
 def test_what_is_done_with_a_tree(state_space, tmp_path):
     model, tree = state_space
     with model:

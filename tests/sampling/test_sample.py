@@ -313,10 +313,10 @@ def test_nuts_refuses_noise():
 @pytest.mark.parametrize("function", [psf.sample_dram, psf.run_models])
 def test_an_old_spelling_names_the_new_one(function):
     with pytest.raises(
-        TypeError, match=r"'stages' any more: give kernel=psf.RandomWalkSettings\(stages=...\)"
+        TypeError, match=r"'stages': give kernel=psf.RandomWalkSettings\(stages=...\)"
     ):
         function({}, stages=1)
-    with pytest.raises(TypeError, match=r"'gather' any more: give comm=psf.Ranks\(gather=...\)"):
+    with pytest.raises(TypeError, match=r"'gather': give comm=psf.Ranks\(gather=...\)"):
         function({}, gather="all")
     with pytest.raises(TypeError, match=r"unexpected keyword argument 'stage'"):
         function({}, stage=1)

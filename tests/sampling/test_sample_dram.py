@@ -166,6 +166,7 @@ def test_a_tree_as_of_pm_sample_with_several_records(noisy):
     assert mine["sample_stats"]["exact"].all()
 
 
+@pytest.mark.filterwarnings("ignore:the terms of a StateSpace variable")
 @pytest.mark.filterwarnings("ignore:log-evidence .* the chains disagree")  # short ones
 def test_what_is_done_with_a_tree(noisy, tmp_path):
     tree = sample_dram(noisy, draws=400, tune=300)

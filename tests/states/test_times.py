@@ -81,6 +81,20 @@ def test_steps_of_the_future_are_as_long_as_dt(model):
     np.testing.assert_array_equal(idata["predictions"]["d_time"], expected)
 
 
+@pytest.mark.parametrize("zone", [None, "Europe/Paris"])
+def test_later_dates_have_a_zone_if_the_data_have_one(zone):
+    there = pd.DatetimeIndex(DATES, tz=zone)
+    model = ou_model(observed=pd.Series(DATA, index=there), unit="D")
+    idata, later = posterior(**IDATA), there[-1:] + pd.Timedelta("36h")
+    found = psf.forecast(idata, model, times=later, n_draws=2, random_seed=1)
+    utc = later if zone is None else later.tz_convert("UTC").tz_localize(None)
+    np.testing.assert_array_equal(found["predictions"]["d_time"], utc)
+    other = later.tz_localize("UTC") if zone is None else later.tz_localize(None)
+    for call in (psf.forecast, psf.free_run):
+        with pytest.raises(ModelError, match=r"times must have (a|no) time zone"):
+            call(idata, model, times=other, n_draws=2)
+
+
 def test_a_record_on_the_grid_is_forecast_at_any_time():
     grid = ou_model(observed=DATA[:4], times=[0.5, 1.0, 2.5, 3.0])
     idata = psf.forecast(posterior(**IDATA), grid, times=[3.2, 4.7], n_draws=2, random_seed=1)

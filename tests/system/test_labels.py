@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pymc as pm
+import pytensor
 import pytest
 import xarray as xr
 
@@ -30,6 +31,41 @@ def test_data_are_aligned_by_label(observed):
     np.testing.assert_allclose(terms, pair_terms(0.5), rtol=1e-12, atol=1e-14)
     run = psf.run_filter(PAIR, psf.EKF(), A, observed, steps=STEPS)
     np.testing.assert_array_equal(run["log_likelihood"], terms)
+
+
+def in_model(coords, panel=("A", "B"), labels=None):
+    """The terms of two records, whose own parameters are a variable with these coordinates."""
+    rows = np.repeat(panel, STEPS.size) if labels is None else labels
+    with pm.Model(coords={"machine": coords}) as model:
+        pm.Normal("a", dims="machine")
+        psf.StateSpace(
+            "d", PAIR, psf.EKF(), panel=rows, steps=np.tile(STEPS, 2),
+            observed=np.tile(PAIR_DATA, (2, 1)),
+        )  # fmt: skip
+    (terms,) = model.compile_logp(model["d"], sum=False)({"a": np.array([0.5, 0.9])})
+    return terms
+
+
+def test_variables_of_a_model_are_aligned_with_the_records_by_their_dimension():
+    expected = [pair_terms(0.5), pair_terms(0.9)]
+    for coords, panel, first in (
+        (["A", "B"], ("A", "B"), 0),
+        (["B", "A"], ("A", "B"), 1),
+        ([3, 7], (7, 3), 1),
+        ([0, 1], (1, 0), 1),
+        ([0, 1], ("A", "B"), 0),  # no labels, but positions
+    ):
+        terms = np.concatenate([expected[first], expected[1 - first]])
+        np.testing.assert_allclose(in_model(coords, panel), terms, rtol=1e-12, atol=1e-14)
+    with pytest.raises(ModelError, match=r"'a' must have a value for each record.*'A', 'C'"):
+        in_model(["A", "C"])
+
+
+def test_the_order_of_records_that_may_be_replaced_is_that_of_the_rows():
+    labels = pytensor.shared(np.repeat([7, 3], STEPS.size))
+    in_model([7, 3], labels=labels)
+    with pytest.raises(ModelError, match=r"in the order of the rows.*\[7, 3\].*got .*\[3, 7\]"):
+        in_model([3, 7], labels=labels)
 
 
 def test_data_of_a_model_are_aligned_by_label():

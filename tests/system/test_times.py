@@ -383,9 +383,11 @@ def test_records_of_a_panel_start_at_their_own_first_dates():
     [
         ({"times": DATES}, "unit must be the duration of one unit of model time"),
         ({"times": DATES, "unit": "Y"}, r"unit must be a duration.*got 'Y'"),
+        ({"times": DATES, "unit": "MS"}, r"unit must be a duration.*got 'MS'"),
         ({"times": DATES, "unit": 3}, r"unit must be a duration.*got 3"),
         ({"times": TIMES, "unit": "D"}, "unit must be None where times are not dates"),
         ({"times": DATES.astype(str)}, "got text"),
+        ({"times": DATES.astype(str), "unit": "D"}, "got text"),
         ({"times": DATES - START}, "got durations"),
         ({"times": TIMES, "t0": START}, "t0 must be a number"),
         ({"times": DATES, "unit": "D", "t0": DATES[3]}, "times must not lie before t0"),
@@ -413,8 +415,23 @@ def test_dates_that_are_refused(settings, message):
         checked_record(EXACT, GivenRecord(DATA, **settings))
 
 
+def test_dates_of_the_data_are_those_of_the_times():
+    series = pd.Series(DATA, index=pd.DatetimeIndex(DATES))
+    expected = checked_record(EXACT, GivenRecord(series, unit="D")).observed
+    found = checked_record(EXACT, GivenRecord(series, times=list(DATES), unit="D"))
+    np.testing.assert_array_equal(found.observed, expected)
+    other = pd.DatetimeIndex(DATES) + pd.Timedelta("1h")
+    for observed, times in ((series, other), (series[::-1], DATES)):
+        with pytest.raises(
+            ModelError, match=r"times must be the dates of observed, got times.0. ="
+        ):
+            checked_record(EXACT, GivenRecord(observed, times=times, unit="D"))
+    with pytest.raises(ModelError, match="the dates of observed must increase"):
+        checked_record(EXACT, GivenRecord(series[::-1], steps=np.arange(DATA.size)))
+
+
 def test_an_index_without_dates_is_named():
-    for index in (DATES.astype(str), None):
+    for index in (DATES.astype(str), None, pd.period_range("2020", periods=DATA.size, freq="M")):
         with pytest.raises(ModelError, match=r"brings no dates.*pd.to_datetime.*got the index"):
             checked_record(EXACT, GivenRecord(pd.Series(DATA, index=index)))
 
@@ -458,3 +475,7 @@ def test_a_run_goes_on_as_one_run(filter, times):
     terms = np.concatenate([first["log_likelihood"], rest["log_likelihood"]])
     np.testing.assert_array_equal(terms, whole["log_likelihood"])
     np.testing.assert_array_equal(rest["obs_time"], whole["obs_time"][9:])
+    if times is DATES:
+        later = pd.DatetimeIndex(DATES[9:], tz="Europe/Paris")
+        with pytest.raises(ModelError, match="times must have no time zone"):
+            psf.run_filter(EXACT, filter, THETA, DATA[9:], times=later, state=first, unit="D")
