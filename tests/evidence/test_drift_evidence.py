@@ -12,11 +12,14 @@ from scipy.stats import halfnorm, multivariate_normal, norm, uniform
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
+from pymc_statespace_filters.evidence.comparison.scaled_prior import ScaledPrior
 from pymc_statespace_filters.evidence.drift.conditional import fit_conditional
+from pymc_statespace_filters.evidence.drift.drift_evidence import _table
 from pymc_statespace_filters.evidence.drift.marginal import ConstantModel, fit_conditionals
 from pymc_statespace_filters.evidence.drift.strengths import StrengthsAtPoints
-from pymc_statespace_filters.evidence.posterior import build_posterior
-from pymc_statespace_filters.importance import log_mean_of_chains
+from pymc_statespace_filters.evidence.drift.widths import bayes_factor_by_width
+from pymc_statespace_filters.evidence.posterior import build_posterior, reproducing_seeds
+from pymc_statespace_filters.importance import LogMean, log_mean_of_chains
 from pymc_statespace_filters.pymc_model.density import ModelDensity
 from tests.systems import wandering_mean
 
@@ -63,23 +66,33 @@ def exact_log_bayes_factor(observed, density=HALF_NORMAL, largest=8 * WIDTH):
     return np.log(drifting[0])
 
 
+def on_grid(largest):
+    """Middles of 2000 cells."""
+    ends = np.linspace(0, largest, 2001)
+    return (ends[1:] + ends[:-1]) / 2
+
+
+def drawn_strengths(grid, log_posterior, n, rng):
+    """Independent draws of a density on a grid."""
+    weights = np.exp(log_posterior - np.max(log_posterior))
+    s = rng.choice(grid, size=n, p=weights / weights.sum())
+    return np.clip(s + (rng.random(n) - 0.5) * (grid[1] - grid[0]), 1e-9, None)
+
+
+def drawn_means(observed, path_covs, rng):
+    """Draws of the mean, each given the covariance (T, T) of the path, by conjugacy."""
+    both = np.column_stack([np.ones(N_ROWS), observed])
+    solved = np.linalg.solve(np.eye(N_ROWS) + path_covs, both).sum(axis=-2)
+    precision = solved[..., 0] + MEAN_SD**-2
+    return solved[..., 1] / precision + rng.standard_normal(solved.shape[:-1]) / np.sqrt(precision)
+
+
 def exact_draws(observed, density, largest, n=(4, 1000), random_seed=3, signed=False):
     """Independent draws of strength and mean: by quadrature, and by conjugacy given it."""
-    rng = np.random.default_rng(random_seed)
-    grid = np.linspace(0, largest, 2001)
-    grid = (grid[1:] + grid[:-1]) / 2
-    log_post = [log_likelihood(observed, s) + np.log(density(s)) for s in grid]
-    weights = np.exp(log_post - np.max(log_post))
-    s = rng.choice(grid, size=n, p=weights / weights.sum())
-    s = np.clip(s + (rng.random(n) - 0.5) * (grid[1] - grid[0]), 1e-9, None)
-    precision, middle = np.empty(n), np.empty(n)
-    for i in np.ndindex(n):
-        solved = np.linalg.solve(
-            np.eye(N_ROWS) + s[i] ** 2 * PATH_COV, np.column_stack([np.ones(N_ROWS), observed])
-        ).sum(axis=0)
-        precision[i] = solved[0] + MEAN_SD**-2
-        middle[i] = solved[1] / precision[i]
-    mu = middle + rng.standard_normal(n) / np.sqrt(precision)
+    rng, grid = np.random.default_rng(random_seed), on_grid(largest)
+    log_posterior = [log_likelihood(observed, s) + np.log(density(s)) for s in grid]
+    s = drawn_strengths(grid, log_posterior, n, rng)
+    mu = drawn_means(observed, s[..., None, None] ** 2 * PATH_COV, rng)
     if signed:
         s = s * rng.choice([-1, 1], size=n)
     return az.from_dict({"posterior": {"mu": mu, "mu_strength": s}})
@@ -126,6 +139,18 @@ def test_widths_are_those_of_quadrature():
     psf.plot_prior_sensitivity(found.widths, backend="none")
 
 
+def test_errors_that_both_means_share_cancel_in_the_curve():
+    """If the terms are the ratios of a width, the factor there is one without an error."""
+    model, observed = drifting_model(0.0, 1)
+    posterior = exact_draws(observed, *PRIORS["half-normal"])["posterior"].to_dataset()
+    ratios, _ = ScaledPrior(model, ("mu_strength",)).log_ratios(posterior, 0.5)
+    found = bayes_factor_by_width(
+        model, posterior, {("mu_strength",): ratios}, np.array([0.5, 1.0]), np.log([0.5] * 2), 0.95
+    )
+    for name in ("width_log_bayes_factor", "width_se"):
+        assert abs(found[name].values[0, 0]) < 1e-12 < abs(found[name].values[0, 1])
+
+
 def test_estimates_of_the_likelihood_give_the_exact_factor():
     model, observed = drifting_model(0.0, 1, psf.BootstrapPF(16))
     row = psf.drift_evidence(noisy_chains(), model, var_names="mu_strength", **QUIET).iloc[0]
@@ -140,6 +165,24 @@ def test_without_seeds_the_numerator_has_fresh_noise():
     mean = log_mean_of_chains(constant.log_terms(posterior, None, np.random.default_rng(1)))
     assert mean.error < 0.15
     assert abs(-mean.value - exact_log_bayes_factor(observed)) < 3.5 * mean.error
+
+
+def test_with_seeds_the_numerator_has_the_noise_of_the_draw(monkeypatch):
+    model, _ = drifting_model(0.0, 1, psf.BootstrapPF(16))
+    density, idata, given = ModelDensity(model), noisy_chains(), []
+    constant = ConstantModel(model, ["mu_strength"], moved=False)
+
+    def evaluate(x, seeds):
+        given.append(seeds[:, 0])
+        return np.zeros(len(x))
+
+    monkeypatch.setattr(constant.density, "evaluate", evaluate)
+    posterior, _ = build_posterior(idata, density)
+    seeds = reproducing_seeds(idata, density)
+    constant.log_terms(posterior, seeds, np.random.default_rng(1))
+    stored = idata["sample_stats"]["d_seed"].values
+    for found, half in zip(given, (stored[:, 1000:], stored[:, :1000]), strict=True):
+        np.testing.assert_array_equal(found, half.ravel())
 
 
 @cache
@@ -159,6 +202,15 @@ def test_drift_beyond_doubt_has_no_error_and_says_what_to_do():
     assert row["prob"] > 0.99
     assert np.isnan(table.widths["width_prob"]).all()
     assert "unknown" in repr(table)
+
+
+def test_models_whose_probabilities_are_equal_are_undecided():
+    name, terms = ("s",), np.zeros((2, 10))
+    for prior, undecided in ((0.5, True), (0.9, False)):
+        weights = np.array([1 - prior, prior])
+        table = _table({name: terms}, {name: LogMean(0.0, 0.1)}, {name: []}, weights, 0.95)
+        assert table.loc["s", "prob"] == pytest.approx(prior)
+        assert table.loc["s", "undecided"] == undecided
 
 
 def test_several_strengths_alone_and_together():
@@ -226,6 +278,8 @@ def test_bounded_variables_without_a_transform_are_not_translated():
     fit = fit_conditionals(strengths, size + rng.random((200, 2)), constant._is_bounded)
     is_a = constant._others == 0  # the constant model has an order of its own
     np.testing.assert_array_equal(fit.translation != 0.0, [is_a, is_a])
+    moved = fit.translated(strengths.sizes, size + rng.random((200, 2)))
+    assert abs(np.corrcoef(size[:, 0], moved[:, is_a][:, 0])[0, 1]) < 0.3  # 0.9 before
 
 
 @pytest.mark.parametrize("largest", [np.inf, 1.5])
@@ -250,9 +304,36 @@ def test_fitted_density_of_a_strength_follows_the_other_parameters():
     assert fitted.shape == pytest.approx(0.5, abs=0.03)
 
 
-def test_strengths_of_a_drifting_system_are_found():
-    observed = record(0.4, 5)
-    constant = psf.StateSpaceModel(
+@pytest.mark.parametrize("shared", [True, False])
+def test_records_of_a_panel_with_one_strength_or_their_own(shared):
+    """A vector of strengths is zero as a whole: of independent records the factors multiply."""
+    records, rng = [record(0.0, 1), record(0.4, 5)], np.random.default_rng(7)
+    with pm.Model() as model:
+        pm.Normal("mu", 0, MEAN_SD, shape=2)
+        pm.HalfNormal("mu_strength", WIDTH, shape=() if shared else 2)
+        psf.StateSpace(
+            "d", SYSTEM, psf.EKF(), panel=np.repeat(["a", "b"], N_ROWS),
+            steps=np.tile(np.arange(N_ROWS), 2), observed=np.concatenate(records),
+        )  # fmt: skip
+    grid = on_grid(8 * WIDTH)
+    logs = np.array(
+        [[log_likelihood(d, s) - log_likelihood(d, 0.0) for s in grid] for d in records]
+    )
+    log_prior = np.log(HALF_NORMAL(grid) * (grid[1] - grid[0]))
+    logs = logs.sum(axis=0, keepdims=True) if shared else logs
+    exact = np.log(np.exp(logs + log_prior).sum(axis=1)).sum()
+    s = np.stack([drawn_strengths(grid, one + log_prior, (4, 1000), rng) for one in logs], -1)
+    covs = np.broadcast_to(s, (4, 1000, 2))[..., None, None] ** 2 * PATH_COV
+    mu = np.stack([drawn_means(records[i], covs[:, :, i], rng) for i in (0, 1)], -1)
+    idata = az.from_dict({"posterior": {"mu": mu, "mu_strength": s[..., 0] if shared else s}})
+    row = psf.drift_evidence(idata, model, var_names="mu_strength", **QUIET).loc["mu_strength"]
+    assert row["se"] < 0.1
+    assert abs(row["log_bayes_factor"] - exact) < 3.5 * row["se"]
+
+
+def constant_mean():
+    """A constant mean with unit noise of the sensor; the mean may drift."""
+    return psf.StateSpaceModel(
         transition=lambda x, q: [0.0 * x[0]],
         process_noise=[[1.0]],
         observation=lambda x, mu: [mu + x[0]],
@@ -260,7 +341,49 @@ def test_strengths_of_a_drifting_system_are_found():
         initial_mean=[0.0],
         initial_cov=[[0.0]],
     )
-    drifting = psf.drifting(constant, mu=psf.RandomWalk())
+
+
+def returning_cov(strength, rate):
+    """Of a path that returns to where it begins: covariances (..., T, T)."""
+    s, r, k = (
+        np.asarray(strength)[..., None, None],
+        np.asarray(rate)[..., None, None],
+        np.arange(N_ROWS),
+    )
+    apart, both = abs(np.subtract.outer(k, k)), np.add.outer(k, k)
+    return s**2 / (2 * r) * (np.exp(-r * apart) - np.exp(-r * both))
+
+
+def test_without_strength_the_rate_of_return_has_no_influence():
+    """Against quadrature over strength and rate; the constant model has the mean alone."""
+    observed, rng = record(0.4, 5), np.random.default_rng(7)
+    returning = psf.drifting(constant_mean(), mu=psf.OrnsteinUhlenbeck())
+    with pm.Model() as model:
+        pm.Normal("mu", 0, MEAN_SD)
+        pm.HalfNormal("mu_strength", WIDTH)
+        pm.LogNormal("mu_rate", np.log(0.3), 1)
+        psf.StateSpace("d", returning, psf.EKF(), steps=range(N_ROWS), observed=observed)
+    s, z = np.meshgrid(np.linspace(0, 4 * WIDTH, 121)[1:] - WIDTH / 60, np.linspace(-4, 4, 81))
+    rate = 0.3 * np.exp(z)
+    covs = returning_cov(s, rate) + np.eye(N_ROWS) + MEAN_SD**2
+    solved = np.linalg.solve(covs, observed[:, None])[..., 0] @ observed
+    log_l = -0.5 * (solved + np.linalg.slogdet(2 * np.pi * covs)[1])
+    log_prior = halfnorm.logpdf(s, scale=WIDTH) + norm.logpdf(z)
+    joint = np.exp(log_l - log_likelihood(observed, 0.0) + log_prior) * WIDTH / 30 * 0.1
+    chosen = rng.choice(s.size, size=(4, 1000), p=joint.ravel() / joint.sum())
+    cell = rng.random((2, 4, 1000)) - 0.5
+    s, z = s.ravel()[chosen] + cell[0] * WIDTH / 30, z.ravel()[chosen] + cell[1] * 0.1
+    rate = 0.3 * np.exp(z)
+    mu = drawn_means(observed, returning_cov(s, rate), rng)
+    idata = az.from_dict({"posterior": {"mu": mu, "mu_strength": s, "mu_rate": rate}})
+    row = psf.drift_evidence(idata, model, **QUIET).loc["mu_strength"]
+    assert row["se"] < 0.1
+    assert abs(row["log_bayes_factor"] - np.log(joint.sum())) < 3.5 * row["se"]
+
+
+def test_strengths_of_a_drifting_system_are_found():
+    observed = record(0.4, 5)
+    drifting = psf.drifting(constant_mean(), mu=psf.RandomWalk())
     with pm.Model() as model:
         pm.Normal("mu", 0, MEAN_SD)
         width = pm.HalfNormal("width", WIDTH)
