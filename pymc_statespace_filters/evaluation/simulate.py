@@ -1,5 +1,6 @@
 """Forward simulation of a system, in machine code."""
 
+import warnings
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -16,7 +17,7 @@ from ..compiler.native.entry_point import address_of, cached_on_disk, call_addre
 from ..compiler.native.jit import copy_into
 from ..compiler.native.python_call import call_in_thread, call_machine_code
 from ..compiler.numerics.philox import generators_of_records
-from ..errors import ModelError
+from ..errors import ModelError, ModelWarning
 from ..parallel.signals import held_interrupts
 from ..progress import slow_compilation
 from ..system.checks import check_flag, check_random_seed
@@ -279,6 +280,11 @@ def simulate(
     ModelError
         If an argument is wrong, or PyMC gives no mean of a distribution where ``noise`` is False.
 
+    Warns
+    -----
+    ModelWarning
+        If observations are not finite: the state overflows, or parameters are out of their domain.
+
     Examples
     --------
     >>> import pymc_statespace_filters as psf
@@ -315,6 +321,7 @@ def simulate(
     rng = check_random_seed(random_seed)
     run = simulator(system, with_noise).function
     states, observations = _run(run, rng, theta, at, forces, record.axis.t0)
+    _warn_unless_finite(observations, lambda j: f"at time {record.times(at[j : j + 1])[0]}")
     n_steps = np.arange(states.shape[0])
     return xr.Dataset(
         {
@@ -338,6 +345,19 @@ def _run(run: Callable, rng: np.random.Generator, theta: np.ndarray, steps: Any,
     return (call_in_thread if is_long else call_machine_code)(run, rng, theta, steps, *rest)
 
 
+def _warn_unless_finite(observations: np.ndarray, place: Callable[[int], str]) -> None:
+    """Warn of numbers that a filter would take for missing observations, or refuse."""
+    if (failed := np.flatnonzero(~np.isfinite(observations).all(axis=1))).size:
+        row = int(failed[0])
+        warnings.warn(
+            f"{failed.size} of {len(observations)} simulated observations are not finite, the "
+            f"first in row {row}, {place(row)}: the state overflows, or a covariance or a "
+            "parameter of a distribution is none at these parameters. As data, NaN is missing.",
+            ModelWarning,
+            skip_file_prefixes=(__file__,),
+        )
+
+
 def _simulate_panel(
     system: StateSpaceModel,
     params: Mapping[str, Any],
@@ -357,6 +377,8 @@ def _simulate_panel(
         for rng, own, (steps, _, inputs, t0) in zip(generators, theta, records, strict=True)
     ]
     states, observations = (np.concatenate(parts) for parts in zip(*simulated, strict=True))
+    labels, of_rows = table.records.labels, table.records.of_rows()
+    _warn_unless_finite(observations, lambda j: f"of record {labels[of_rows[j]]!r}")
     n_steps = [np.arange(len(path)) for path, _ in simulated]
     return xr.Dataset(
         {

@@ -246,3 +246,21 @@ def test_a_distribution_without_a_mean_has_no_simulation_without_noise():
         psf.simulate(system, {"a": 0.5}, noise=False, **arguments)
     with pytest.raises(psf.errors.ModelError, match="noise must be True or False, got 0"):
         psf.simulate(system, {"a": 0.5}, noise=0, **arguments)
+
+
+def test_observations_that_are_not_finite_are_not_taken_for_missing_ones():
+    system = psf.StateSpaceModel(
+        transition=lambda x: [x[0] ** 2],
+        observation=lambda x: [x[0]],
+        observation_noise=lambda v: [[v]],
+        initial_mean=lambda start: [start],
+        initial_cov=[[0.0]],
+    )
+    at = {"steps": [0, 2, 9, 10, 12], "t0": 5.0, "random_seed": 1}
+    with pytest.warns(psf.errors.ModelWarning, match=r"^5 of 5 .* in row 0, at time 5.0: .* none"):
+        psf.simulate(system, {"v": -1.0, "start": 0.5}, **at)
+    with pytest.warns(psf.errors.ModelWarning, match=r"^2 of 5 .* in row 3, at time 15.0: .* over"):
+        psf.simulate(system, {"v": 1.0, "start": 3.0}, **at)
+    panel = {"panel": ["A", "A", "B", "B"], "steps": [0, 9, 0, 10], "random_seed": 1}
+    with pytest.warns(psf.errors.ModelWarning, match="^1 of 4 .* in row 3, of record 'B'"):
+        psf.simulate(system, {"v": 1.0, "start": 3.0}, **panel)
