@@ -93,6 +93,7 @@ GROUPS = {
         "average_models",
         "prior_sensitivity",
         "drift_evidence",
+        "select_terms",
         "step_error",
         "reweight",
         "chib_jeliazkov",

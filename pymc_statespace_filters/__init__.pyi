@@ -74,6 +74,7 @@ from .system.model import StateSpaceModel
 from .system.panel_frame import panel_from
 from .system.stationary import stationary
 from .system.steps import nearest_steps
+from .terms import select_terms
 
 __version__: str
 
@@ -145,6 +146,7 @@ __all__ = [
     "sample",
     "sample_dram",
     "sample_smc",
+    "select_terms",
     "simulate",
     "smoothed_states",
     "stationary",

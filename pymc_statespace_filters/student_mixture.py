@@ -17,6 +17,7 @@ from scipy.special import gammaln, logsumexp
 
 DEGREES_OF_FREEDOM = 5.0
 N_STEPS, MIN_STEP = 200, 1e-3  # EM iterations; smallest gain in nats per draw
+ROUNDING = 1e-10  # of the largest eigenvalue, the least one of a conditional scale matrix
 WIDE_WEIGHT, WIDE_SCALE = 0.1, 1.5  # of the defensive component; scale in those of the draws
 
 Array = NDArray[np.float64]
@@ -68,6 +69,45 @@ class StudentMixture:
         """The same with wider components."""
         return StudentMixture(self.weights, self.means, scale * self.chols)
 
+    def conditioned(
+        self, kept: NDArray[np.int64], given: NDArray[np.int64], values: Array
+    ) -> "StudentMixture":
+        """Near the law of the coordinates ``kept`` where others, ``given``, have these values.
+
+        Each component has the conditional mean and scale of a normal law, and the weight that its
+        marginal density at the values gives it.
+        """
+        gap = values - self.means[:, given]
+        scales = self.chols @ np.swapaxes(self.chols, 1, 2)
+        marginal = scales[:, given][:, :, given]
+        gain = scales[:, kept][:, :, given] @ np.linalg.inv(marginal)
+        means = self.means[:, kept] + np.einsum("jab,jb->ja", gain, gap)
+        left = scales[:, kept][:, :, kept] - gain @ scales[:, given][:, :, kept]
+        there = StudentMixture(self.weights, self.means[:, given], np.linalg.cholesky(marginal))
+        log_weights = there.log_joint(values[None])[:, 0]
+        weights = np.exp(log_weights - logsumexp(log_weights))
+        return StudentMixture(weights, means, _factors(left))
+
+    def tilted(self, slope: Array) -> "StudentMixture":
+        """Near the law of a density that is this one times exp(slope x), with slope (k,).
+
+        Each component has the mean and the weight that a normal law would have.
+        """
+        roots = np.swapaxes(self.chols, 1, 2) @ slope
+        moves = np.einsum("jab,jb->ja", self.chols, roots)
+        log_weights = np.log(self.weights) + self.means @ slope + 0.5 * (roots**2).sum(axis=1)
+        weights = np.exp(log_weights - logsumexp(log_weights))
+        return StudentMixture(weights, self.means + moves, self.chols)
+
+    def with_wide_part(self, weight: float, scale: float) -> "StudentMixture":
+        """A mixture of this one and a wider copy of it."""
+        wide = self.widened(scale)
+        return StudentMixture(
+            np.concatenate([(1 - weight) * self.weights, weight * wide.weights]),
+            np.concatenate([self.means, wide.means]),
+            np.concatenate([self.chols, wide.chols]),
+        )
+
     def affine(self, mean: Array, chol: Array) -> "StudentMixture":
         """The distribution of mean + chol x."""
         return StudentMixture(self.weights, mean + self.means @ chol.T, chol @ self.chols)
@@ -89,6 +129,14 @@ def standardised(x: Array) -> Standardised | None:
     except np.linalg.LinAlgError:
         return None
     return Standardised(mean, chol, (x - mean) @ np.linalg.inv(chol).T)
+
+
+def _factors(scales: Array) -> Array:
+    """Cholesky factors of differences (J, k, k) that rounding may have made indefinite."""
+    values, vectors = np.linalg.eigh((scales + np.swapaxes(scales, 1, 2)) / 2)
+    least = ROUNDING * np.max(values, axis=-1, keepdims=True, initial=ROUNDING)
+    roots = vectors * np.sqrt(np.maximum(values, least))[:, None, :]
+    return np.linalg.cholesky(roots @ np.swapaxes(roots, 1, 2))
 
 
 def place_components(x: Array, n_components: int, rng: np.random.Generator) -> StudentMixture:

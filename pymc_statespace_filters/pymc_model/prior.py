@@ -1,6 +1,6 @@
 """The prior of a model on its unconstrained space: support, log-density, draws; likelihood."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -115,10 +115,14 @@ def _widths(rv: TensorVariable, model: pm.Model) -> Iterator[float]:
 
 
 class ModelPrior:
-    """The distribution of a model's free variables; Potentials belong to the likelihood."""
+    """The distribution of a model's free variables; Potentials belong to the likelihood.
 
-    def __init__(self, model: pm.Model) -> None:
+    With ``variables``, that of some of them.
+    """
+
+    def __init__(self, model: pm.Model, variables: Sequence[TensorVariable] | None = None) -> None:
         self._model = model
+        self._free = model.free_RVs if variables is None else list(variables)
 
     def log_density(self, x: Array) -> Array:
         """Log-density of points x (m, k), Jacobians included; NaN becomes -inf."""
@@ -136,12 +140,12 @@ class ModelPrior:
             to the edge of the support, where the transform is infinite.
         """
         model = self._model
-        if improper := [rv.name for rv in model.free_RVs if not can_sample(rv, model)]:
+        if improper := [rv.name for rv in self._free if not can_sample(rv, model)]:
             raise ModelError(
                 f"the prior of {', '.join(improper)} is improper and cannot be sampled: "
                 "give it a proper prior"
             )
-        if restricted := [rv.name for rv in model.free_RVs if is_restricted(rv, model)]:
+        if restricted := [rv.name for rv in self._free if is_restricted(rv, model)]:
             raise ModelError(
                 f"the prior of {', '.join(restricted)} cannot be sampled: its transform excludes "
                 "a part of the distribution's support, and the density is not normalised"
@@ -165,8 +169,8 @@ class ModelPrior:
     def _check_no_atoms(self, draws: Array) -> None:
         """Raise if a variable takes single values with positive probability, as a clipped one."""
         model, start = self._model, self._model.initial_point()
-        sizes = [start[model.rvs_to_values[rv].name].size for rv in model.free_RVs]
-        names = np.repeat([rv.name for rv in model.free_RVs], sizes)
+        sizes = [start[model.rvs_to_values[rv].name].size for rv in self._free]
+        names = np.repeat([rv.name for rv in self._free], sizes)
         for name, column in zip(names, draws.T, strict=True):
             repeated = len(column) - len(np.unique(column))
             if repeated > _MAX_REPEATED * len(column):
@@ -178,13 +182,13 @@ class ModelPrior:
 
     @cached_property
     def _density(self) -> RowFunction:
-        return RowFunction(self._model, self._model.logp(vars=self._model.free_RVs))
+        return RowFunction(self._model, self._model.logp(vars=self._free))
 
     @cached_property
     def _draw(self) -> tuple[Any, list[SharedVariable]]:
         """A function that draws all free variables, unconstrained, and its generators."""
         mapped = []
-        for rv in self._model.free_RVs:
+        for rv in self._free:
             transform = self._model.rvs_to_transforms[rv]
             value = rv if transform is None else transform.forward(rv, *rv.owner.inputs)
             mapped.append(pt.flatten(value))

@@ -4,9 +4,12 @@ The number of components minimises the variance of the weights of held-out draws
 """
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from ...student_mixture import StudentMixture, fit_mixture, place_components
+from ...importance import normalised, systematic
+from ...smc.temperature import next_temperature
+from ...student_mixture import StudentMixture, fit_mixture, place_components, standardised
 from ..posterior import Posterior
 from .whitening import moments
 
@@ -14,6 +17,10 @@ MOST_COMPONENTS = 10
 MIN_GAIN = 0.02  # in the log of the weights' second moment, to accept a further component
 PATIENCE = 2  # further numbers of components tried after the best
 MOST_FITTED = 4000  # draws used for the fit
+ESS_FRACTION = 0.2  # of a cloud, left by the power of its weights
+N_FLATTENED, N_COMPONENTS = 1000, 10  # of the fit to a flattened copy
+
+Array = NDArray[np.float64]
 
 
 def choose_mixture(posterior: Posterior, rng: np.random.Generator) -> StudentMixture:
@@ -41,3 +48,20 @@ def choose_mixture(posterior: Posterior, rng: np.random.Generator) -> StudentMix
     # Restart EM from the best fit, so that it converges to the same mode.
     final = fit_mixture(np.concatenate([first, second]), best)
     return final.with_defensive_component().affine(mean, chol)
+
+
+def flattened_copy(
+    x: Array, log_ratio: Array, rng: np.random.Generator, n_components: int = N_COMPONENTS
+) -> list[StudentMixture]:
+    """The fit to points x (m, k) weighted by a power of a ratio of densities, if there is one.
+
+    The power is the largest that leaves a fifth of the points.
+    """
+    if not np.isfinite(log_ratio).any():
+        return []
+    power = next_temperature(0.0, log_ratio, ESS_FRACTION)
+    chosen = x[systematic(normalised(power * log_ratio), N_FLATTENED, rng)]
+    if (copy := standardised(chosen)) is None:
+        return []
+    mixture = fit_mixture(copy.z, place_components(copy.z, n_components, rng))
+    return [mixture.affine(copy.mean, copy.chol)]

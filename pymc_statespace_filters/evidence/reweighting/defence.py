@@ -26,16 +26,13 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from ...errors import ModelError
-from ...importance import normalised, systematic
-from ...smc.temperature import next_temperature
-from ...student_mixture import StudentMixture, fit_mixture, place_components, standardised
+from ...student_mixture import StudentMixture
+from ..estimators.student_mixture import flattened_copy
 from ..posterior import Posterior
 
 SCALE = 3.0  # of the wide part, in widths of the fit to the draws
 N_CLOUD = 2000
 N_ROUNDS, N_SEARCHED = 10, 50  # of the search by the exact likelihood; points in each
-ESS_FRACTION = 0.2  # of a cloud, left by the power of its weights
-N_FITTED, N_COMPONENTS = 1000, 10  # of the fit to a flattened copy
 
 Array = NDArray[np.float64]
 
@@ -82,8 +79,8 @@ def defensive_mixture(
     """
     cloud = Mixture([*_proper_prior(posterior, rng), fit.widened(SCALE)])
     x = cloud.sample(N_CLOUD, rng)
-    copy = _flattened(x, posterior.evaluate(x, rng) - cloud.log_density(x), rng)
-    found: list[Law] = []
+    copy = flattened_copy(x, posterior.evaluate(x, rng) - cloud.log_density(x), rng)
+    found: Sequence[Law] = []
     x, log_ratio = x[:0], np.empty(0)
     for _ in range(N_ROUNDS):
         search = Mixture([*cloud.parts, *found, *found])
@@ -91,7 +88,7 @@ def defensive_mixture(
         new = new[fit.log_density(new) < level]
         x = np.concatenate([x, new])
         log_ratio = np.append(log_ratio, exact(new) - search.log_density(new))
-        found = _flattened(x, log_ratio, rng)
+        found = flattened_copy(x, log_ratio, rng)
     return Mixture([*cloud.parts, fit, *copy, *found])
 
 
@@ -103,15 +100,3 @@ def _proper_prior(posterior: Posterior, rng: np.random.Generator) -> list[Law]:
     except ModelError:
         return []
     return [prior]
-
-
-def _flattened(x: Array, log_ratio: Array, rng: np.random.Generator) -> list[Law]:
-    """The fit to points x (m, k) weighted by a power of a ratio of densities, if there is one."""
-    if not np.isfinite(log_ratio).any():
-        return []
-    power = next_temperature(0.0, log_ratio, ESS_FRACTION)
-    chosen = x[systematic(normalised(power * log_ratio), N_FITTED, rng)]
-    if (copy := standardised(chosen)) is None:
-        return []
-    mixture = fit_mixture(copy.z, place_components(copy.z, N_COMPONENTS, rng))
-    return [mixture.affine(copy.mean, copy.chol)]

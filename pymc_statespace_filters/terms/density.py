@@ -1,0 +1,69 @@
+"""Densities of the sub-models of a full model, all by one compiled function."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pymc as pm
+from numpy.typing import NDArray
+
+from ..pymc_model.switched_density import DensityInParts, SwitchedDensity
+from .candidates import Candidates
+
+BLOCK = 50_000  # points that are evaluated in one call
+
+Array = NDArray[np.float64]
+Columns = NDArray[np.int64]
+Seeds = NDArray[np.int64]
+Sets = NDArray[np.bool_]
+
+
+class Point(NamedTuple):
+    """Points of sub-models: of n of them, the vectors, the terms that are there, noise seeds."""
+
+    x: Array  # (n, k), unconstrained; columns of absent terms have no influence
+    present: Sets  # (n, K)
+    seeds: Seeds  # (n, v)
+
+
+class SubmodelDensity:
+    """The log-densities of all sub-models.
+
+    Attributes
+    ----------
+    density : SwitchedDensity
+    candidate_of : ndarray of int, shape (k,)
+        The candidate of every column of the unconstrained vector; K for those of none.
+    """
+
+    def __init__(self, model: pm.Model, candidates: Candidates) -> None:
+        self.model, self.candidates = model, candidates
+        self.density = SwitchedDensity(model, candidates.switches)
+        self.candidate_of = candidates.switches.number_of(len(self.density.blocks))
+
+    @property
+    def blocks(self) -> Columns:
+        """As of `SwitchedDensity`."""
+        return self.density.blocks
+
+    @property
+    def n_blocks(self) -> int:
+        """How many there are."""
+        return int(self.blocks.max()) + 1
+
+    def fresh_seeds(self, count: int, rng: np.random.Generator) -> Seeds:
+        """Seeds of independent noise for so many points."""
+        size = (count, len(self.density.seed_names))
+        return rng.integers(np.iinfo(np.int64).max, size=size)
+
+    def columns_of(self, present: Sets) -> Columns:
+        """The columns that a sub-model has: all but those of absent terms."""
+        return np.flatnonzero(np.append(present, True)[self.candidate_of])
+
+    def evaluate(self, at: Point) -> DensityInParts:
+        """The densities at points, with the priors in them."""
+        rows = [slice(i, i + BLOCK) for i in range(0, max(len(at.x), 1), BLOCK)]
+        parts = [
+            self.density.evaluate_in_parts(at.x[one], at.present[one], at.seeds[one])
+            for one in rows
+        ]
+        return DensityInParts(*map(np.concatenate, zip(*parts, strict=True)))

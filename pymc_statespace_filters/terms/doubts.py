@@ -1,0 +1,45 @@
+"""Why probabilities of terms may be less certain than their errors suggest."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from ..errors import ModelError
+from .candidates import Candidates
+from .estimates import Weighted
+from .probabilities import Probabilities
+
+MAX_SHARE = 0.01  # of the probability, in sub-models of unreliable evidence
+
+
+def check_finite(points: Sequence[Weighted], candidates: Candidates) -> None:
+    """Raise if no sub-model without some candidate has a density that is not zero."""
+    present = np.array([one.proposal.present for one in points])
+    possible = np.array([np.isfinite(one.log_weights).any() for one in points])
+    for j, key in enumerate(candidates.keys):
+        without = ~present[:, j]
+        if without.any() and not possible[without].any():
+            values = candidates.switches.values[j].tolist()
+            raise ModelError(
+                f"absent must give a value of {key!r} at which the likelihood is not zero, got "
+                f"{values[0] if isinstance(key, str) else tuple(values)}: the density is zero or "
+                "not finite at all points of all sub-models without it"
+            )
+
+
+def doubts(
+    found: Probabilities, points: Sequence[Weighted], candidates: Candidates
+) -> Iterator[str]:
+    """Why the errors of inclusions may be too small."""
+    poor = np.array([not one.is_reliable for one in points])
+    share = float(found.of_models[poor].sum())
+    if share > MAX_SHARE:
+        worst = int(np.argmax(np.where(poor, found.of_models, -1.0)))
+        labels = np.array(candidates.labels)[found.present[worst]]
+        yield (
+            f"sub-models with {share:.0%} of the probability have few effective points, such as "
+            f"that with {', '.join(labels) or 'none of the terms'} (Pareto k "
+            f"{points[worst].pareto_k:.2f}, {points[worst].n_effective:.0f} "
+            "effective points): give more draws of the full model as idata, or a filter with more "
+            "particles where the likelihood is noisy"
+        )

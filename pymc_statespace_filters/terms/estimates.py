@@ -1,0 +1,157 @@
+r"""The evidence of sub-models by importance sampling, each from points of its own.
+
+.. math::
+
+    Z_M = E_{x \sim q_M}[w], \qquad w = f_M(x) / q_M(x) .
+
+The mean of the raw weights is unbiased whatever the proposal :math:`q_M` is, and with unbiased
+estimates of the likelihood, each with fresh noise. Points of different sub-models are independent,
+so that the errors of evidences are. Points that a proposal is fitted to serve for nothing else.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..importance import (
+    MIN_EFFECTIVE,
+    LogMean,
+    largest_good_k,
+    log_mean_of_independent,
+    pareto_k,
+)
+from .density import Array, Point, Seeds, SubmodelDensity
+from .proposals import Proposal
+from .unused import same
+
+LEAST_FOR_TAIL = 25  # weights to which a Pareto tail is fitted
+
+
+@dataclass(frozen=True)
+class Weighted:
+    """Points of a sub-model with their weights, and the law that they come from.
+
+    Attributes
+    ----------
+    proposal : Proposal
+    x : ndarray (n, k)
+    seeds : ndarray of int (n, v)
+    log_weights : ndarray (n,)
+    """
+
+    proposal: Proposal
+    x: Array
+    seeds: Seeds
+    log_weights: Array
+
+    @property
+    def count(self) -> int:
+        """The number of points."""
+        return len(self.log_weights)
+
+    @cached_property
+    def mean(self) -> LogMean:
+        """The evidence."""
+        return log_mean_of_independent(self.log_weights)
+
+    @property
+    def n_effective(self) -> float:
+        """The effective number of points."""
+        return self.mean.kish_ess(self.count)
+
+    @property
+    def efficiency(self) -> float:
+        """Effective points per point, of 0 to 1."""
+        return self.n_effective / self.count
+
+    @cached_property
+    def pareto_k(self) -> float:
+        """The shape of the upper tail of the weights."""
+        if self.count < LEAST_FOR_TAIL or np.isneginf(self.log_weights).all():
+            return np.inf
+        return pareto_k(self.log_weights)
+
+    @property
+    def is_reliable(self) -> bool:
+        """Whether the error of the mean can be believed."""
+        is_light = self.pareto_k <= largest_good_k(self.count)
+        return is_light and self.n_effective >= MIN_EFFECTIVE / 2
+
+    def joined(self, more: "Weighted") -> "Weighted":
+        """With more points of the same proposal."""
+        return Weighted(
+            self.proposal,
+            np.concatenate([self.x, more.x]),
+            np.concatenate([self.seeds, more.seeds]),
+            np.concatenate([self.log_weights, more.log_weights]),
+        )
+
+    def without_points(self) -> "Weighted":
+        """The weights alone, which need less memory."""
+        return replace(self, x=self.x[:0], seeds=self.seeds[:0])
+
+    def refitted(self, rng: np.random.Generator) -> Proposal:
+        """The proposal fitted to the weighted points."""
+        return self.proposal.refitted(self.x, self.log_weights, rng)
+
+
+class Sampler:
+    """Draws points of sub-models and weights them.
+
+    Parameters
+    ----------
+    density : SubmodelDensity
+    base : ndarray (k,)
+        Values for columns that a sub-model does not have.
+    pool : ndarray (m, k)
+        Draws of the prior.
+    """
+
+    def __init__(
+        self, density: SubmodelDensity, base: Array, pool: Array, rng: np.random.Generator
+    ) -> None:
+        self._density, self._base, self._pool, self._rng = density, base, pool, rng
+        self.n_evaluations = 0
+
+    def is_free(self, proposals: Sequence[Proposal]) -> NDArray[np.bool_]:
+        """Whether densities are the same for all values of what is taken for unused."""
+        points = [one.sample(1, self._base, self._pool, self._rng)[0] for one in proposals]
+        before = np.concatenate(points)
+        after = before.copy()
+        for row, one in zip(after, proposals, strict=True):
+            row[one.unused] = self._pool[self._rng.integers(len(self._pool)), one.unused]
+        present = np.array([one.present for one in proposals])
+        seeds = self._density.fresh_seeds(len(before), self._rng)
+        left_out = np.array([one.unused_blocks for one in proposals])
+        a, b = (self._left(Point(x, present, seeds), left_out) for x in (before, after))
+        return same(a, b)
+
+    def _left(self, at: Point, left_out: NDArray[np.bool_]) -> Array:
+        """Log-densities (n,) without the priors of blocks (n, blocks) that integrate to one."""
+        found = self._density.evaluate(at)
+        self.n_evaluations += len(at.x)
+        return np.asarray(found.total - np.where(left_out, found.own, 0.0).sum(axis=1))
+
+    def draw(self, proposals: Sequence[Proposal], counts: Sequence[int]) -> list[Weighted]:
+        """So many points of each proposal."""
+        if not proposals:
+            return []
+        drawn = [
+            one.sample(count, self._base, self._pool, self._rng)
+            for one, count in zip(proposals, counts, strict=True)
+        ]
+        x = np.concatenate([points for points, _ in drawn])
+        present = np.repeat([one.present for one in proposals], counts, axis=0)
+        seeds = self._density.fresh_seeds(len(x), self._rng)
+        left_out = np.repeat([one.unused_blocks for one in proposals], counts, axis=0)
+        log_left = self._left(Point(x, present, seeds), left_out)
+        log_q = np.concatenate([log_q for _, log_q in drawn])
+        log_weights = log_left - log_q
+        ends = np.cumsum(counts)[:-1]
+        parts = (np.split(each, ends) for each in (x, seeds, log_weights))
+        return [
+            Weighted(proposal, *each) for proposal, *each in zip(proposals, *parts, strict=True)
+        ]

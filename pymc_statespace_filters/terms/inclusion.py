@@ -1,0 +1,121 @@
+r"""The prior over sub-models: which are permitted, and how probable each of them is.
+
+With ``"beta-binomial"`` every *number* of terms is as probable as any other, and all sets of equal
+size are:
+
+.. math::
+
+    p(M) = \frac{1}{(K + 1) \binom{K}{|M|}},
+
+a Binomial prior whose probability of inclusion is itself uniform (Scott and Berger 2010): the
+penalty of many candidates comes with it. Otherwise terms are present independently of each other.
+What is required of a set restricts either prior to the sets that are permitted.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import betaln
+
+from ..errors import ModelError
+from ..importance import normalised
+from ..system.checks import is_finite
+from .candidates import Candidates
+
+BETA_BINOMIAL = "beta-binomial"
+
+Array = NDArray[np.float64]
+Sets = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class InclusionPrior:
+    """The prior of sets of K candidates.
+
+    Attributes
+    ----------
+    log_odds : ndarray (K,) or None
+        Of independent candidates; None for the beta-binomial prior.
+    needed : ndarray of bool (K, K)
+        Which others (columns) a candidate (row) requires.
+    """
+
+    log_odds: Array | None
+    needed: Sets
+
+    def permits(self, present: Sets) -> NDArray[np.bool_]:
+        """Whether sets (..., K) have what their members require."""
+        lacking = present[..., :, None] & self.needed & ~present[..., None, :]
+        return np.asarray(~lacking.any(axis=(-1, -2)))
+
+    def log_weight(self, present: Sets) -> Array:
+        """The log-probability of permitted sets (..., K), up to a constant."""
+        if self.log_odds is not None:
+            return np.asarray(present @ self.log_odds)
+        n, size = present.shape[-1], present.sum(axis=-1)
+        return np.asarray(betaln(size + 1, n - size + 1))
+
+    def all_sets(self) -> Sets:
+        """All permitted sets, (S, K)."""
+        n = len(self.needed)
+        every = (np.arange(2**n)[:, None] >> np.arange(n)) & 1
+        present = every.astype(bool)
+        return np.asarray(present[self.permits(present)])
+
+    def probabilities(self, present: Sets) -> Array:
+        """The probabilities of all permitted sets (S, K)."""
+        return normalised(self.log_weight(present))
+
+
+def read_inclusion(candidates: Candidates, inclusion: Any, requires: Any) -> InclusionPrior:
+    """Check the arguments ``inclusion`` and ``requires`` of `select_terms`."""
+    return InclusionPrior(_log_odds(candidates, inclusion), _needed(candidates, requires))
+
+
+def _log_odds(candidates: Candidates, inclusion: Any) -> Array | None:
+    if isinstance(inclusion, str) and inclusion == BETA_BINOMIAL:
+        return None
+    if isinstance(inclusion, Mapping):
+        numbers = [candidates.number(key, "inclusion") for key in inclusion]
+        if missing := [key for i, key in enumerate(candidates.keys) if i not in numbers]:
+            raise ModelError(f"inclusion must have a probability for every candidate: {missing}")
+        given = [_probability(inclusion[key], key) for key in candidates.keys]
+    else:
+        given = [_probability(inclusion)] * len(candidates)
+    p = np.array(given)
+    return np.asarray(np.log(p) - np.log1p(-p))
+
+
+def _probability(value: Any, key: Any = None) -> float:
+    if is_finite(value) and 0 < value < 1:
+        return float(value)
+    of_key = "" if key is None else f" for {key!r}"
+    raise ModelError(
+        f"inclusion must be {BETA_BINOMIAL!r}, a probability between 0 and 1, or a dictionary from "
+        f"candidates to such probabilities, got {value!r}{of_key}"
+    )
+
+
+def _needed(candidates: Candidates, requires: Any) -> Sets:
+    needed = np.zeros((len(candidates),) * 2, dtype=bool)
+    if requires is None:
+        return needed
+    if not isinstance(requires, Mapping):
+        raise ModelError(
+            "requires must be a dictionary from candidates to those without which they are not "
+            f"considered, such as {{'k3': 'k1'}}, got {requires!r}"
+        )
+    for key, others in requires.items():
+        row = candidates.number(key, "requires")
+        for other in _listed(others):
+            needed[row, candidates.number(other, "requires")] = True
+    if needed.diagonal().any():
+        raise ModelError(f"requires must not name a candidate for itself, got {requires!r}")
+    return needed
+
+
+def _listed(others: Any) -> Sequence[Any]:
+    return others if isinstance(others, list) else [others]

@@ -1,0 +1,97 @@
+"""The DataTree of `select_terms`."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+
+from ..pymc_model.inspection import filters_used
+from .candidates import Candidates
+from .density import Array, Sets, SubmodelDensity
+from .draws import Averaged, posterior_of
+from .estimates import Weighted
+from .probabilities import Probabilities
+
+COPIED = ("observed_data", "constant_data")
+
+
+def as_datatree(
+    found: Probabilities,
+    points: Sequence[Weighted],
+    prior: Array,
+    drawn: Averaged,
+    density: SubmodelDensity,
+    idata: xr.DataTree,
+) -> xr.DataTree:
+    """The result; sub-models are ordered by probability.
+
+    ``prior`` (S,) has the prior probabilities of the sub-models.
+    """
+    order = np.argsort(-found.of_models, kind="stable")
+    number = np.empty(len(order), dtype=np.int64)
+    number[order] = np.arange(len(order))
+    like = idata["posterior"].to_dataset()
+    groups = {
+        "terms": _terms(found, prior, density.candidates),
+        "models": _models(found, points, prior, density.candidates, order),
+        "posterior": posterior_of(drawn, found.present, density, like),
+        "sample_stats": _stats(drawn, number, density, like),
+    }
+    groups |= {name: idata[name].to_dataset() for name in COPIED if name in idata.children}
+    tree = xr.DataTree.from_dict(groups)
+    tree.attrs |= filters_used(density.model)
+    return tree
+
+
+def _terms(found: Probabilities, prior: Array, candidates: Candidates) -> xr.Dataset:
+    labels = candidates.labels
+    return xr.Dataset(
+        {
+            "inclusion": ("term", found.inclusion),
+            "inclusion_se": ("term", found.inclusion_se),
+            "prior_inclusion": ("term", prior @ found.present),
+            "median_model": ("term", found.inclusion > 0.5),
+            "pairs": (("term", "term_other"), found.pairs),
+        },
+        coords={"term": labels, "term_other": labels},
+    )
+
+
+def _models(
+    found: Probabilities,
+    points: Sequence[Weighted],
+    prior: Array,
+    candidates: Candidates,
+    order: np.ndarray,
+) -> xr.Dataset:
+    by_model = {
+        "probability": found.of_models,
+        "probability_se": found.of_models_se,
+        "log_evidence": found.log_evidence,
+        "se": found.error,
+        "prior": prior,
+        "n_evaluations": np.array([one.count for one in points]),
+        "n_effective": np.array([one.n_effective for one in points]),
+        "pareto_k": np.array([one.pareto_k for one in points]),
+    }
+    present: Sets = found.present[order]
+    return xr.Dataset(
+        {"present": (("model", "term"), present)}
+        | {name: ("model", values[order]) for name, values in by_model.items()},
+        coords={"model": np.arange(len(order)), "term": candidates.labels},
+    )
+
+
+def _stats(
+    drawn: Averaged, number: np.ndarray, density: SubmodelDensity, like: xr.Dataset
+) -> xr.Dataset:
+    shape = like.sizes["chain"], like.sizes["draw"]
+    columns = {"model": number[drawn.model]}
+    columns |= {
+        f"{name}_seed": seeds
+        for name, seeds in zip(density.density.seed_names, drawn.seeds.T, strict=True)
+    }
+    return xr.Dataset(
+        {name: (("chain", "draw"), values.reshape(shape)) for name, values in columns.items()},
+        coords={dim: like[dim] for dim in ("chain", "draw")},
+    )

@@ -1,0 +1,162 @@
+"""The public function: which terms belong in the equation."""
+
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+
+from ..compiler.native.compilation import COMPILATION
+from ..errors import EvidenceWarning, ModelError
+from ..progress import row_progress
+from ..pymc_model.inspection import given_model
+from ..pymc_model.posterior_draws import posterior_group
+from ..sampling import sample
+from ..system.checks import check_random_seed
+from .candidates import read_candidates
+from .density import SubmodelDensity
+from .doubts import doubts
+from .draws import averaged
+from .enumeration import estimate_all, probabilities
+from .estimates import Sampler
+from .inclusion import BETA_BINOMIAL, read_inclusion
+from .proposals import Guide
+from .result import as_datatree
+from .unused import find_uses, prior_pool
+
+MOST_CANDIDATES = 12
+
+
+def select_terms(
+    model: pm.Model,
+    absent: Mapping[Any, Any],
+    *,
+    idata: xr.DataTree | None = None,
+    inclusion: Any = BETA_BINOMIAL,
+    requires: Mapping[Any, Any] | None = None,
+    random_seed: int | np.random.Generator | None = None,
+    progressbar: bool = True,
+) -> xr.DataTree:
+    r"""Compute the probability of every term of an equation, from draws of the full model.
+
+    The model has all candidate terms, with the priors that they have if they are there. A
+    sub-model lacks some of them: their variables are held at the values at which the terms vanish,
+    and its density is that of the full model there, over the priors of these variables.
+
+    Parameters
+    ----------
+    model : pymc.Model
+        The full model, with continuous free variables; with any likelihood, with noise or without.
+    absent : mapping
+        The candidates, and the values at which their terms vanish: a scalar variable ``"k3"``, an
+        element ``"b[3]"``, or a tuple of such names, with a tuple of values, for what comes and
+        goes together. At most 12.
+    idata : xarray.DataTree, optional
+        Posterior draws of the full model, from any sampler. They say where to look, and not what
+        the result is. Default: those of `sample`.
+    inclusion : "beta-binomial", float or mapping
+        Prior of the sub-models. ``"beta-binomial"``: each number of terms is as probable as any
+        other, and so are all sets of one size. A number: the probability of each term,
+        independently of the others; or such a number for each candidate.
+    requires : mapping, optional
+        For a candidate another one, or a list of them, without which it is not considered:
+        ``{"k3": "k1"}``. The prior is restricted to the sub-models that remain.
+    random_seed : int or numpy.random.Generator, optional
+    progressbar : bool
+        Whether to show a progress bar if the evaluations take more than two seconds.
+
+    Returns
+    -------
+    xarray.DataTree
+        ``terms`` : along ``term``, the probability of ``inclusion``, its standard error
+        ``inclusion_se``, ``prior_inclusion``, and ``median_model``, the terms of a probability
+        above one half; ``pairs`` along ``term`` and ``term_other``, the probability that both are
+        present.
+
+        ``models`` : all sub-models along ``model``, most probable first, with what is ``present``
+        along ``term``; ``probability`` with its error ``probability_se``, ``log_evidence`` with its
+        error ``se``, ``prior``, and of the points behind it the number ``n_evaluations``, the
+        effective number ``n_effective`` and the tail of their weights, ``pareto_k``.
+
+        ``posterior`` : draws averaged over the sub-models, with all variables of the full model.
+        Where a draw lacks a term, its variables have the values of ``absent``. ``sample_stats`` has
+        the sub-model of each draw, and the noise seed of its likelihood.
+
+    Raises
+    ------
+    ModelError
+        If an argument is invalid: a candidate that is no free variable or has no density of its
+        own, a value at which the likelihood is not finite, two candidates that switch off the same
+        term, too many candidates.
+    DataMismatchError
+        If the draws belong to another model.
+
+    Warns
+    -----
+    EvidenceWarning
+        If sub-models that matter have few effective points.
+
+    Notes
+    -----
+    The evidence of each sub-model is the mean of importance weights from a mixture that is fitted
+    to draws of the full model and conditioned on the values of ``absent``, or fitted again to its
+    own points. With an unbiased filter every point has fresh noise, so that the mean is exact, and
+    the standard errors contain the noise.
+
+    Variables that only absent terms use have their prior: the scale of the slabs, the gap of a
+    spring that is not there.
+
+    References
+    ----------
+    J. G. Scott and J. O. Berger (2010). Bayes and empirical-Bayes multiplicity adjustment in the
+    variable-selection problem. Annals of Statistics 38, 2587-2619.
+
+    M. M. Barbieri and J. O. Berger (2004). Optimal predictive model selection. Annals of Statistics
+    32, 870-897.
+
+    Examples
+    --------
+    Does the damping have a quadratic part?
+
+    >>> import numpy as np
+    >>> import pymc as pm
+    >>> import pymc_statespace_filters as psf
+    >>> v = np.linspace(-1, 1, 9)
+    >>> force = 0.8 * v + 0.1 * np.array([0.3, -0.4, 1.1, -0.2, 0.6, 0.1, -1.2, 0.5, -0.7])
+    >>> with pm.Model() as full:
+    ...     c1, c2 = pm.Normal("c1", 0, 1), pm.Normal("c2", 0, 1)
+    ...     y = pm.Normal("y", c1 * v + c2 * abs(v) * v, 0.1, observed=force)
+    >>> found = psf.select_terms(full, {"c1": 0.0, "c2": 0.0}, random_seed=1, progressbar=False)
+    >>> found["terms"]["inclusion"].round(1).to_series().to_dict()
+    {'c1': 1.0, 'c2': 0.2}
+    """
+    model = given_model(model)
+    candidates = read_candidates(model, absent)
+    prior = read_inclusion(candidates, inclusion, requires)
+    if len(candidates) > MOST_CANDIDATES:
+        raise ModelError(
+            f"absent must have at most {MOST_CANDIDATES} candidates, got {len(candidates)}: "
+            "tuples of terms that come and go together count once"
+        )
+    rng = check_random_seed(random_seed)
+    if idata is None:
+        idata = sample(model=model, random_seed=rng, progressbar=progressbar)
+    assert idata is not None, "draws on another rank"
+    like = posterior_group(idata)
+    with COMPILATION:
+        density = SubmodelDensity(model, candidates)
+        guide = Guide(density, idata, rng)
+        with row_progress(density.density.calls, enabled=progressbar) as announce:
+            uses = find_uses(density, guide.draws, rng)
+            sampler = Sampler(density, guide.base, prior_pool(density, uses, rng), rng)
+            sets = prior.all_sets()
+            points = estimate_all(sets, candidates, prior, guide, uses, sampler, rng, announce)
+        found = probabilities(points, sets, prior.log_weight(sets))
+        count = like.sizes["chain"] * like.sizes["draw"]
+        drawn = averaged(points, found.of_models, count, rng)
+        tree = as_datatree(found, points, prior.probabilities(sets), drawn, density, idata)
+    for doubt in doubts(found, points, candidates):
+        warnings.warn(f"probabilities of terms: {doubt}", EvidenceWarning, stacklevel=2)
+    return tree

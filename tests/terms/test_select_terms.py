@@ -1,0 +1,239 @@
+"""Sub-models of a regression, whose evidences are known, and what a term leaves unused."""
+
+from functools import cache
+
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.errors import ModelError
+from tests.terms.regression import Regression
+
+
+def few_terms(**changes):
+    """Four candidates, the first two nearly collinear, the last one with a half-normal slab."""
+    return Regression(3, n_terms=4, n=20, **changes)
+
+
+def selected(regression, model=None, **settings):
+    model = regression.model() if model is None else model
+    draws = regression.draws(1)
+    settings = {"random_seed": 2, "progressbar": False, "idata": draws} | settings
+    return psf.select_terms(model, regression.absent, **settings)
+
+
+@cache
+def few_selected():
+    """The result with known slabs, which several tests look at."""
+    return selected(few_terms())
+
+
+def in_order(found, regression, values):
+    """Values by sub-model, in the order of the result."""
+    by_set = {tuple(one): value for one, value in zip(regression.sets, values, strict=True)}
+    return np.array([by_set[tuple(one)] for one in found["models"]["present"].values])
+
+
+@pytest.mark.parametrize("slab_unknown", [False, True])
+def test_evidences_of_all_sub_models_are_exact(slab_unknown):
+    regression = few_terms(slab_unknown=slab_unknown)
+    found = selected(regression) if slab_unknown else few_selected()
+    models, terms = found["models"], found["terms"]
+    truth = in_order(found, regression, regression.log_evidence)
+    # Of 2^4 normal errors the largest is below 4 but for one time in 1000.
+    error = np.maximum(models["se"].values, 1e-4)  # of the quadrature
+    assert np.abs((models["log_evidence"].values - truth) / error).max() < 4
+    assert (models["se"].values < 0.2).all()
+    distance = (terms["inclusion"].values - regression.inclusion()) / terms["inclusion_se"].values
+    assert np.abs(distance).max() < 4
+    assert (terms["inclusion_se"].values < 0.006).all()
+    # Without terms nothing is unknown, but for a slab that nothing uses.
+    assert models["se"].values[~models["present"].values.any(axis=1)] < 1e-9
+
+
+def test_a_plain_model_has_the_evidences_of_the_state_space_model():
+    regression = few_terms()
+    one = few_selected()["models"]
+    other = selected(regression, regression.model(as_system=False))["models"]
+    # The same random numbers: the densities agree but for rounding.
+    np.testing.assert_allclose(one["log_evidence"], other["log_evidence"], rtol=1e-9)
+    np.testing.assert_array_equal(one["present"], other["present"])
+
+
+def test_priors_of_inclusion_and_requirements():
+    regression = few_terms()
+    every, evidence = regression.sets, regression.log_evidence
+    p = np.array([0.1, 0.5, 0.9, 0.3])
+    inclusion = dict(zip(regression.absent, p, strict=True))
+    found = selected(regression, inclusion=inclusion, requires={"b3": ["b0", "b2"]})
+    permitted = ~every[:, 3] | (every[:, 0] & every[:, 2])
+    prior = np.where(every, p, 1 - p).prod(axis=1) * permitted
+    posterior = prior * np.exp(evidence - evidence.max())
+    posterior /= posterior.sum()
+    terms, models = found["terms"], found["models"]
+    assert models.sizes["model"] == permitted.sum()
+    np.testing.assert_allclose(
+        models["prior"], in_order(found, regression, prior / prior.sum()), rtol=1e-9
+    )
+    np.testing.assert_allclose(terms["inclusion"], posterior @ every, atol=0.02)
+    pairs = every.T @ (posterior[:, None] * every)
+    np.testing.assert_allclose(terms["pairs"], pairs, atol=0.02)
+    np.testing.assert_array_equal(terms["median_model"], terms["inclusion"] > 0.5)
+
+
+def test_draws_are_averaged_over_sub_models():
+    regression, found = few_terms(), few_selected()
+    present = found["models"]["present"].values[found["sample_stats"]["model"].values]
+    draws = np.stack([found["posterior"][name].values for name in regression.absent], axis=-1)
+    np.testing.assert_array_equal(draws != 0, present)
+    share = present.mean(axis=(0, 1))
+    np.testing.assert_allclose(share, found["terms"]["inclusion"], atol=0.03)
+    # Given the sub-model with all terms, the law is that of the full model.
+    exact = regression.draws(5, n_draws=4000)["posterior"]
+    full = present.all(axis=-1)
+    for name, one in zip(regression.absent, np.moveaxis(draws, -1, 0), strict=True):
+        values = exact[name].values
+        assert abs(one[full].mean() - values.mean()) < 5 * values.std() / full.sum() ** 0.5
+
+
+def gap_model(observed):
+    """A force with a gap, which matters where its stiffness is not zero."""
+    x = np.linspace(0, 1, 7)
+    with pm.Model() as model:
+        k = pm.HalfNormal("k", 1)
+        gap = pm.Beta("gap", 2, 5)
+        level = pm.Normal("level", 0, 1)
+        pm.Deterministic("twice", 2 * k)
+        force = level + k * pm.math.maximum(x - gap, 0)
+        pm.Normal("y", force, 0.5, observed=observed)
+    return model
+
+
+def test_what_only_an_absent_term_uses_has_its_prior():
+    y = np.array([0.3, -0.2, 0.4, 0.1, 0.5, -0.3, 0.4])
+    model = gap_model(y)
+    rng = np.random.default_rng(0)
+    prior = {"k": np.abs(rng.normal(size=(2, 300))), "gap": rng.beta(2, 5, size=(2, 300))}
+    prior |= {"level": 0.2 + 0.2 * rng.normal(size=(2, 300))}
+    idata = xr.DataTree.from_dict(
+        {"posterior": xr.Dataset({k: (("chain", "draw"), v) for k, v in prior.items()})}
+    )
+    found = psf.select_terms(model, {"k": 0.0}, idata=idata, random_seed=1, progressbar=False)
+    models = found["models"]
+    without = ~models["present"].values[:, 0]
+    # A normal mean with a normal prior.
+    cov = 0.25 * np.eye(7) + 1.0
+    truth = -0.5 * (y @ np.linalg.solve(cov, y) + np.linalg.slogdet(2 * np.pi * cov)[1])
+    difference = models["log_evidence"].values[without] - truth
+    assert abs(difference) < 4 * models["se"].values[without]
+    gap = found["posterior"]["gap"].values[found["posterior"]["k"].values == 0]
+    assert abs(gap.mean() - 2 / 7) < 5 * 0.16 / len(gap) ** 0.5
+
+
+def test_what_comes_and_goes_together():
+    regression = few_terms()
+    absent = {("b0", "b1"): (0.0, 0.0), "b2": 0.0, "b3": 0.0}
+    found = psf.select_terms(
+        regression.model(), absent, idata=regression.draws(1), random_seed=2, progressbar=False
+    )
+    assert list(found["terms"]["term"].values) == ["b0, b1", "b2", "b3"]
+    evidence = dict(zip(map(tuple, regression.sets), regression.log_evidence, strict=True))
+    models = found["models"]
+    for present, value, error in zip(
+        models["present"].values, models["log_evidence"].values, models["se"].values, strict=True
+    ):
+        pair, *others = present
+        assert abs(value - evidence[(pair, pair, *others)]) < 4 * error + 1e-6
+
+
+def test_elements_of_a_vector():
+    regression = few_terms()
+    with pm.Model() as model:
+        b = pm.Normal("b", 0, 1, shape=3)
+        last = pm.HalfNormal("b3", 1)
+        mean = (regression.inputs[:, :3] * b).sum(axis=1) + regression.inputs[:, 3] * last
+        pm.Normal("y", mean, 1.0, observed=regression.y)
+    scalars = regression.draws(1)["posterior"].to_dataset()
+    vector = np.stack([scalars[f"b{i}"].values for i in range(3)], axis=-1)
+    posterior = xr.Dataset({"b": (("chain", "draw", "term"), vector), "b3": scalars["b3"]})
+    absent = {"b[0]": 0.0, "b[1]": 0.0, "b[2]": 0.0, "b3": 0.0}
+    found = psf.select_terms(
+        model, absent, idata=xr.DataTree.from_dict({"posterior": posterior}), random_seed=2,
+        progressbar=False,
+    )  # fmt: skip
+    scalar = few_selected()["models"]
+    np.testing.assert_allclose(found["models"]["log_evidence"], scalar["log_evidence"], rtol=1e-9)
+    assert found["posterior"]["b"].dims == ("chain", "draw", "term")
+
+
+def test_states_of_averaged_draws():
+    regression = few_terms()
+    found, model = few_selected(), regression.model()
+    kwargs = {"n_draws": 20, "random_seed": 1, "extend_inferencedata": False}
+    predicted = psf.forecast(
+        found, model, n_steps=3, inputs=np.vstack([regression.inputs, np.ones((4, 4))]), **kwargs
+    )
+    assert np.isfinite(predicted["predictions"]["y"].values).all()
+
+
+@pytest.mark.parametrize(
+    ("absent", "settings", "message"),
+    [
+        ({}, {}, "absent must be a dictionary"),
+        ({"k7": 0.0}, {}, "got 'k7', which is unknown"),
+        ({"y": 0.0}, {}, "got 'y', which is no free variable"),
+        ({"b0": np.inf}, {}, "a finite number for 'b0', at which its term vanishes, got inf"),
+        ({("b0", "b1"): 0.0}, {}, "2 finite numbers for"),
+        ({"b0": 0.0, ("b0", "b1"): (0.0, 0.0)}, {}, "every scalar once, got 'b0'"),
+        ({3: 0.0}, {}, "got 3"),
+        ({"b0": 0.0}, {"inclusion": 1.0}, "inclusion must be .* got 1.0"),
+        ({"b0": 0.0}, {"inclusion": {"b1": 0.5}}, "inclusion must name candidates"),
+        ({"b0": 0.0, "b1": 0.0}, {"inclusion": {"b1": 0.5}}, "for every candidate"),
+        ({"b0": 0.0}, {"requires": {"b0": "b0"}}, "for itself"),
+        ({"b0": 0.0}, {"requires": {"b0": "b1"}}, "requires must name candidates"),
+        ({"b0": 0.0}, {"requires": "b0"}, "requires must be a dictionary"),
+    ],
+)
+def test_a_wrong_argument_is_named(absent, settings, message):
+    regression = few_terms()
+    with pytest.raises(ModelError, match=message):
+        psf.select_terms(regression.model(), absent, idata=regression.draws(1), **settings)
+
+
+def draws_of(**values):
+    rng = np.random.default_rng(1)
+    posterior = {
+        name: (("chain", "draw"), mean + 0.2 * rng.standard_normal((2, 100)))
+        for name, mean in values.items()
+    }
+    return xr.DataTree.from_dict({"posterior": xr.Dataset(posterior)})
+
+
+def test_two_candidates_of_one_term_are_named():
+    with pm.Model() as model:
+        k, size = pm.Normal("k", 0, 1), pm.Normal("size", 0, 1)
+        pm.Normal("y", k * size, 1.0, observed=[0.5, 1.0])
+    with pytest.raises(ModelError, match="'k' and 'size' switch off the same"):
+        psf.select_terms(
+            model, {"k": 0.0, "size": 0.0}, idata=draws_of(k=1, size=1), progressbar=False
+        )
+
+
+def test_a_likelihood_that_is_not_finite_is_named():
+    with pm.Model() as model:
+        mu, sd = pm.Normal("mu", 0, 1), pm.Normal("sd", 1, 0.2)
+        pm.Normal("y", mu, sd, observed=[0.5, 1.0])
+    with pytest.raises(ModelError, match="a value of 'sd' at which the likelihood is not zero"):
+        psf.select_terms(model, {"sd": 0.0}, idata=draws_of(mu=0.7, sd=1), progressbar=False)
+
+
+def test_elements_with_a_joint_density_are_refused():
+    with pm.Model() as model:
+        b = pm.MvNormal("b", np.zeros(2), np.eye(2))
+        pm.Normal("y", b.sum(), 1.0, observed=[0.5, 1.0])
+    with pytest.raises(ModelError, match="an element of 'b', whose elements have a joint density"):
+        psf.select_terms(model, {"b[0]": 0.0}, idata=draws_of(mu=0.7), progressbar=False)
+    with pytest.raises(ModelError, match="name them one by one"):
+        psf.select_terms(model, {"b": 0.0}, idata=draws_of(mu=0.7), progressbar=False)
