@@ -8,6 +8,7 @@ the tails (Hesterberg 1995).
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -99,13 +100,20 @@ class StudentMixture:
         weights = np.exp(log_weights - logsumexp(log_weights))
         return StudentMixture(weights, self.means + moves, self.chols)
 
-    def with_wide_part(self, weight: float, scale: float) -> "StudentMixture":
-        """A mixture of this one and a wider copy of it."""
-        wide = self.widened(scale)
+    def with_wide_parts(self, parts: Mapping[float, float]) -> "StudentMixture":
+        """A mixture of this one and wider copies of it, of these scales with these weights."""
+        mixture, share = self, 1 - sum(parts.values())
+        for scale, weight in parts.items():
+            share += weight
+            mixture = mixture.mixed_with(self.widened(scale), weight / share)
+        return mixture
+
+    def mixed_with(self, other: "StudentMixture", weight: float) -> "StudentMixture":
+        """A mixture of this one and another, which has this weight."""
         return StudentMixture(
-            np.concatenate([(1 - weight) * self.weights, weight * wide.weights]),
-            np.concatenate([self.means, wide.means]),
-            np.concatenate([self.chols, wide.chols]),
+            np.concatenate([(1 - weight) * self.weights, weight * other.weights]),
+            np.concatenate([self.means, other.means]),
+            np.concatenate([self.chols, other.chols]),
         )
 
     def affine(self, mean: Array, chol: Array) -> "StudentMixture":

@@ -120,9 +120,28 @@ class SwitchedDensity(RowFunction):
         found, own, held = self.calls(np.concatenate([x, is_on], axis=1), *seeds.T)
         return DensityInParts(np.where(np.isnan(found), -np.inf, found), own, held)
 
+    def held_priors(self) -> "HeldPriors":
+        """The densities of what is held, where all switches are off, without the likelihood."""
+        return HeldPriors(self.model, self._graphs)
+
     def constrained(self, variables: Sequence[TensorVariable]) -> "SwitchedValues":
         """Variables of the model as functions of a point and its switches."""
         return SwitchedValues(self._graphs, variables)
+
+
+class HeldPriors(RowFunction):
+    """The log-densities of all blocks at the values at which they are held, given the others."""
+
+    def __init__(self, model: pm.Model, graphs: "_SwitchedGraphs") -> None:
+        self._n_switches = graphs.n_switches
+        held = graphs.held_terms
+        super().__init__(model, held.sum(), [held], point=graphs.point)
+
+    def at(self, x: Array) -> Array:
+        """At points x (m, k), shape (m, blocks)."""
+        off = np.zeros((len(x), self._n_switches))
+        seeds = np.broadcast_to(self.model_seeds, (len(x), self.model_seeds.size))
+        return self.calls(np.concatenate([x, off], axis=1), *seeds.T)[1]
 
 
 class SwitchedValues:
@@ -152,7 +171,7 @@ class _SwitchedGraphs:
         self._on = pt.dvector("switches")
         self._number = _by_variable(shapes, switches.number_of(_size(shapes)))
         self._held = _by_variable(shapes, switches.held_at(_size(shapes)))
-        self._n_switches = len(switches)
+        self.n_switches = len(switches)
         # Free variables of which something is held; their values are symbols until `_completed`.
         self._symbols = {
             rv: rv.type(name=rv.name)
@@ -242,7 +261,7 @@ class _SwitchedGraphs:
     def _is_on(self, rv: TensorVariable) -> TensorVariable:
         """Whether the elements of a variable are not held."""
         flat = [
-            self._on[number] > 0.5 if number < self._n_switches else pt.constant(True)
+            self._on[number] > 0.5 if number < self.n_switches else pt.constant(True)
             for number in self._number[rv].flat
         ]
         return pt.stack(flat).reshape(self._number[rv].shape)

@@ -1,12 +1,15 @@
 """Densities of the sub-models of a full model, all by one compiled function."""
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 import pymc as pm
 from numpy.typing import NDArray
+from pytensor.graph.traversal import ancestors
 
-from ..pymc_model.switched_density import DensityInParts, SwitchedDensity
+from ..pymc_model.inspection import element_names
+from ..pymc_model.switched_density import DensityInParts, HeldPriors, SwitchedDensity
 from .candidates import Candidates
 
 BLOCK = 50_000  # points that are evaluated in one call
@@ -39,6 +42,35 @@ class SubmodelDensity:
         self.model, self.candidates = model, candidates
         self.density = SwitchedDensity(model, candidates.switches)
         self.candidate_of = candidates.switches.number_of(len(self.density.blocks))
+
+    @cached_property
+    def scaled_columns(self) -> Columns:
+        """Those of candidates whose priors depend on free variables that are no candidates."""
+        model = self.model
+        names = [name.partition("[")[0] for name in element_names(model)]
+        own = {names[column] for one in self.candidates.switches.columns for column in one}
+        depends = []
+        for rv in model.free_RVs:
+            above = {one.name for one in set(ancestors([rv])) & set(model.free_RVs)} - {rv.name}
+            if rv.name in own and above and not above & own:
+                depends.append(rv.name)
+        is_scaled = np.isin(names, depends) & (self.candidate_of < len(self.candidates))
+        return np.flatnonzero(is_scaled)
+
+    def log_prior_held(self, x: Array) -> Array:
+        """The prior log-densities (n, k) of columns where they are held, given other variables.
+
+        They are zero where `scaled_columns` has no column.
+        """
+        found = np.zeros_like(x)
+        if (scaled := self.scaled_columns).size:
+            held = self._prior_held.at(x)
+            found[:, scaled] = held[:, self.blocks[scaled]]
+        return found
+
+    @cached_property
+    def _prior_held(self) -> HeldPriors:
+        return self.density.held_priors()
 
     @property
     def blocks(self) -> Columns:

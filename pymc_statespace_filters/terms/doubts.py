@@ -10,6 +10,7 @@ from .estimates import Weighted
 from .probabilities import Probabilities
 
 MAX_SHARE = 0.01  # of the probability, in sub-models of unreliable evidence
+NEGLIGIBLE = 0.005  # probability of a single one
 
 
 def check_finite(points: Sequence[Weighted], candidates: Candidates) -> None:
@@ -31,7 +32,8 @@ def doubts(
     found: Probabilities, points: Sequence[Weighted], candidates: Candidates
 ) -> Iterator[str]:
     """Why the errors of inclusions may be too small."""
-    poor = np.array([not one.is_reliable for one in points])
+    counts = found.of_models > NEGLIGIBLE
+    poor = np.array([not one.is_reliable for one in points]) & counts
     share = float(found.of_models[poor].sum())
     if share > MAX_SHARE:
         worst = int(np.argmax(np.where(poor, found.of_models, -1.0)))

@@ -18,13 +18,14 @@ from .probabilities import Probabilities
 from .proposals import Guide, Proposal
 from .unused import Uses
 
-N_SCREENED, N_POINTS = 25, 200  # points of each sub-model: of all, and of those within reach
-REACH = 15.0  # nats below the most probable sub-model, beyond which one is left as it is
-N_REFITS, GOOD = 5, 0.25  # most refits of a proposal; effective points per point that suffice
+N_SCREENED = 25  # points of every sub-model
+REACH = 10.0  # nats below the most probable sub-model, beyond which one is left as it is
+N_PILOT, GOOD = 200, 0.25  # points that judge a proposal; effective points per point that suffice
+N_REFITS = 5
+FEWEST = 100  # points of a sub-model within reach
+LARGE, ENOUGH = 0.01, 1000  # such an influence, and the points of such a sub-model at least
 TARGET_SE = 0.005  # of an inclusion
-MATTERS = 0.002  # influence of a sub-model on an inclusion, from which its weights must be good
-MOST_POINTS = 50_000  # that are added to reach it
-N_ROUNDS = 6
+N_ROUNDS, MOST_POINTS = 6, 50_000  # of points that are added to reach it
 
 Announce = Callable[[str, int], None]
 
@@ -47,10 +48,19 @@ def estimate_all(
     check_finite(found, candidates)
     chosen = _within_reach(found, log_prior)
     found = [one if chosen[i] else one.without_points() for i, one in enumerate(found)]
-    better = improved([found[i] for i in np.flatnonzero(chosen)], sampler, rng, announce)
-    for i, one in zip(np.flatnonzero(chosen), better, strict=True):
+    within = np.flatnonzero(chosen)
+    pilots = improved([found[i].proposal for i in within], sampler, rng, announce)
+    # Weights by which a proposal was chosen are no part of an estimate: good luck is chosen too.
+    judged = list(found)
+    for i, one in zip(within, pilots, strict=True):
+        judged[i] = one
+    counts = np.maximum(_least(probabilities(judged, sets, log_prior)), FEWEST)[within]
+    announce("sub-models within reach", int(counts.sum()))
+    drawn = sampler.draw([one.proposal for one in pilots], counts.tolist())
+    for i, one in zip(within, drawn, strict=True):
         found[i] = one
-    return _until_certain(found, sets, log_prior, sampler, rng, announce)
+    found = _with_lighter_tails(found, sets, log_prior, sampler, rng, announce)
+    return _until_certain(found, sets, log_prior, sampler, announce)
 
 
 def _proposals(sets: Sets, guide: Guide, uses: Uses, sampler: Sampler) -> list[Proposal]:
@@ -71,25 +81,28 @@ def _within_reach(found: Sequence[Weighted], log_prior: Array) -> np.ndarray:
 
 
 def improved(
-    found: Sequence[Weighted], sampler: Sampler, rng: np.random.Generator, announce: Announce
+    proposals: Sequence[Proposal], sampler: Sampler, rng: np.random.Generator, announce: Announce
 ) -> list[Weighted]:
-    """Points of sub-models from proposals that are fitted again until they are good."""
-    best = list(found)
-    pending = list(range(len(best)))
-    proposals = [one.proposal for one in best]
-    for round in range(N_REFITS + 1):
-        announce("proposals", N_POINTS * len(pending))
-        drawn = sampler.draw([proposals[i] for i in pending], [N_POINTS] * len(pending))
+    """Proposals that are fitted again until they are good, each with the points that judged it."""
+    current = list(proposals)
+    best: dict[int, Weighted] = {}
+    before: list[list[Weighted]] = [[] for _ in current]
+    pending = list(range(len(current)))
+    for _ in range(N_REFITS + 1):
+        announce("proposals", N_PILOT * len(pending))
+        drawn = sampler.draw([current[i] for i in pending], [N_PILOT] * len(pending))
+        poor = []
         for i, one in zip(pending, drawn, strict=True):
-            if round == 0 or one.efficiency > best[i].efficiency:
+            if i not in best or one.efficiency > best[i].efficiency:
                 best[i] = one
-        poor = [(i, one) for i, one in zip(pending, drawn, strict=True) if one.efficiency < GOOD]
-        for i, one in poor:
-            proposals[i] = one.refitted(rng)
-        pending = [i for i, one in poor if proposals[i] is not one.proposal]
+            if one.efficiency < GOOD:
+                current[i] = one.refitted(rng, before[i])
+                before[i].append(one)
+                poor.append(i)
+        pending = [i for i in poor if current[i] is not before[i][-1].proposal]
         if not pending:
             break
-    return best
+    return [best[i] for i in range(len(current))]
 
 
 def probabilities(found: Sequence[Weighted], sets: Sets, log_prior: Array) -> Probabilities:
@@ -101,22 +114,15 @@ def probabilities(found: Sequence[Weighted], sets: Sets, log_prior: Array) -> Pr
 
 
 def _until_certain(
-    found: Sequence[Weighted],
-    sets: Sets,
-    log_prior: Array,
-    sampler: Sampler,
-    rng: np.random.Generator,
-    announce: Announce,
+    found: Sequence[Weighted], sets: Sets, log_prior: Array, sampler: Sampler, announce: Announce
 ) -> list[Weighted]:
     """Add points until the inclusions have the error that is aimed at."""
     points, left = list(found), MOST_POINTS
     for _ in range(N_ROUNDS):
         known = probabilities(points, sets, log_prior)
-        points = _with_lighter_tails(points, known, sampler, rng, announce)
-        known = probabilities(points, sets, log_prior)
         more = np.minimum(_missing(known, [one.count for one in points]), left)
         chosen = np.flatnonzero(more * [len(one.x) for one in points])
-        if known.inclusion_se.max() <= TARGET_SE or not chosen.size:
+        if not chosen.size:
             break
         announce("more points", int(more[chosen].sum()))
         drawn = sampler.draw([points[i].proposal for i in chosen], more[chosen].tolist())
@@ -127,23 +133,35 @@ def _until_certain(
 
 
 def _with_lighter_tails(
-    points: Sequence[Weighted],
-    known: Probabilities,
+    found: Sequence[Weighted],
+    sets: Sets,
+    log_prior: Array,
     sampler: Sampler,
     rng: np.random.Generator,
     announce: Announce,
 ) -> list[Weighted]:
-    """Fresh points of fitted proposals for sub-models that matter and are not reliable."""
-    influence = known.influence()
-    poor = [i for i, one in enumerate(points) if influence[i] > MATTERS and not one.is_reliable]
-    counts = [max(points[i].count, 2 * N_POINTS) for i in poor]
-    announce("better proposals", sum(counts))
-    drawn = sampler.draw([points[i].refitted(rng) for i in poor], counts)
-    better = list(points)
-    for i, one in zip(poor, drawn, strict=True):
-        if one.is_reliable or one.pareto_k < points[i].pareto_k:
-            better[i] = one
+    """Fresh points of better proposals, where weights that matter have a heavy tail."""
+    influence = probabilities(found, sets, log_prior).influence()
+    poor = [i for i, one in enumerate(found) if influence[i] > LARGE and not one.is_reliable]
+    counts = [found[i].count for i in poor]
+    announce("better proposals", 2 * sum(counts))
+    trials = sampler.draw([found[i].refitted(rng) for i in poor], counts)
+    lighter = [
+        (i, one) for i, one in zip(poor, trials, strict=True) if one.pareto_k < found[i].pareto_k
+    ]
+    fresh = sampler.draw([one.proposal for _, one in lighter], [one.count for _, one in lighter])
+    better = list(found)
+    for (i, _), one in zip(lighter, fresh, strict=True):
+        better[i] = one
     return better
+
+
+def _least(known: Probabilities) -> np.ndarray:
+    """How many points sub-models need in any case, (S,), by what they matter.
+
+    A spread found from few points may be too small.
+    """
+    return np.ceil(ENOUGH * np.minimum(known.influence() / LARGE, 1.0)).astype(np.int64)
 
 
 def _missing(known: Probabilities, counts: Sequence[int]) -> np.ndarray:
@@ -151,7 +169,7 @@ def _missing(known: Probabilities, counts: Sequence[int]) -> np.ndarray:
     n = np.array(counts)
     spread = np.where(np.isfinite(known.error), known.error, 0.0) * np.sqrt(n)
     share = known.influence() * spread
-    needed = share * share.sum() / TARGET_SE**2
+    needed = np.maximum(share * share.sum() / TARGET_SE**2, _least(known))
     missing = np.maximum(np.ceil(needed - n), 0)
     scale = min(1.0, n[share > 0].sum() / max(missing.sum(), 1.0))
-    return np.asarray(np.ceil(scale * missing).astype(np.int64))
+    return np.ceil(scale * missing).astype(np.int64)

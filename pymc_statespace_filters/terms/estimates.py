@@ -93,9 +93,11 @@ class Weighted:
         """The weights alone, which need less memory."""
         return replace(self, x=self.x[:0], seeds=self.seeds[:0])
 
-    def refitted(self, rng: np.random.Generator) -> Proposal:
-        """The proposal fitted to the weighted points."""
-        return self.proposal.refitted(self.x, self.log_weights, rng)
+    def refitted(self, rng: np.random.Generator, others: Sequence["Weighted"] = ()) -> Proposal:
+        """The proposal fitted to the weighted points, and to those of other proposals."""
+        x = np.concatenate([self.x, *(one.x for one in others)])
+        log_weights = np.concatenate([self.log_weights, *(one.log_weights for one in others)])
+        return self.proposal.refitted(x, log_weights, rng)
 
 
 class Sampler:

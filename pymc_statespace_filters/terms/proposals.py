@@ -10,7 +10,7 @@ out. A wide part bounds the weights in the tails. Whatever is fitted is a proper
 density: it decides the error of an evidence, and not its mean.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pymc as pm
@@ -21,12 +21,13 @@ from ..errors import ModelError
 from ..evidence.estimators.student_mixture import flattened_copy
 from ..pymc_model.posterior_draws import unconstrained_draws
 from ..student_mixture import StudentMixture, fit_mixture, place_components, standardised
-from .density import Array, Columns, Point, Sets, SubmodelDensity
+from .coordinates import Coordinates, fitted_coordinates
+from .density import Array, Columns, Sets, SubmodelDensity
 
 MOST_FITTED = 4000  # draws
 MOST_COMPONENTS, MIN_GAIN = 6, 0.02  # of the mixture; nats per held-out draw for one more
-WIDE_WEIGHT, WIDE_SCALE = 0.1, 2.0
-N_REGRESSED = 200  # draws, of prior densities on other variables
+WIDE = {2.0: 0.2, 4.0: 0.1}  # wide parts of a proposal: their scales, and weights
+FIRST = 0.25  # weight of the first proposal in one that was fitted again
 N_REFITTED = 4  # components of a mixture fitted to weighted points
 
 
@@ -41,8 +42,9 @@ class Proposal:
     drawn, unused : ndarray of int
         Columns drawn from the mixture, and from the prior.
     unused_blocks : ndarray of bool (blocks,)
-    mixture : StudentMixture
-        Of the columns ``drawn``.
+    mixture, first : StudentMixture
+        Of the coordinates of the columns ``drawn``; what it was before it was fitted again.
+    coordinates : Coordinates
     """
 
     present: Sets
@@ -50,6 +52,8 @@ class Proposal:
     unused: Columns
     unused_blocks: NDArray[np.bool_]
     mixture: StudentMixture
+    first: StudentMixture
+    coordinates: Coordinates
 
     def sample(
         self, count: int, base: Array, pool: Array, rng: np.random.Generator
@@ -59,20 +63,26 @@ class Proposal:
         ``base`` (k,) has values for the columns of absent terms, and ``pool`` (m, k) draws of the
         prior.
         """
-        x = np.tile(base, (count, 1))
-        x[:, self.drawn] = self.mixture.sample(count, rng)
-        x[:, self.unused] = pool[rng.integers(len(pool), size=count)][:, self.unused]
-        return x, self.mixture.log_density(x[:, self.drawn])
+        y = np.tile(base, (count, 1))
+        drawn = self.mixture.sample(count, rng)
+        y[:, self.drawn] = drawn
+        y[:, self.unused] = pool[rng.integers(len(pool), size=count)][:, self.unused]
+        x, log_volume = self.coordinates.backward(y, self.drawn)
+        return x, self.mixture.log_density(drawn) + log_volume
 
     def refitted(self, x: Array, log_weights: Array, rng: np.random.Generator) -> "Proposal":
-        """Fitted to weighted points of this one; the same if these have no weights."""
+        """Fitted to weighted points of proposals; the same if these have no weights.
+
+        A part of the first proposal stays: points that are few may all be in one region.
+        """
         if not self.drawn.size:
             return self
-        copy = flattened_copy(x[:, self.drawn], log_weights, rng, N_REFITTED)
+        y = self.coordinates.forward(x)[:, self.drawn]
+        copy = flattened_copy(y, log_weights, rng, N_REFITTED)
         if not copy:
             return self
-        mixture = copy[0].with_wide_part(WIDE_WEIGHT, WIDE_SCALE)
-        return Proposal(self.present, self.drawn, self.unused, self.unused_blocks, mixture)
+        fit = copy[0].with_wide_parts(WIDE)
+        return replace(self, mixture=fit.mixed_with(self.first, FIRST))
 
 
 class Guide:
@@ -99,15 +109,18 @@ class Guide:
         candidates = density.candidates.switches
         values = _values_of(idata, density.model, thin)
         self._values = candidates.held_at(self.draws.shape[1])
+        self._coordinates = fitted_coordinates(density, self.draws, values)
+        y = self._coordinates.forward(self.draws)
+        scaled = self._coordinates.of_values(values, self.draws)
         # The column of the fit on which an absent scalar is conditioned.
         self._given = np.arange(self.draws.shape[1])
-        columns = [self.draws]
+        columns = [y]
         for column in np.concatenate(candidates.columns):
             if not np.array_equal(values[:, column], self.draws[:, column]):
                 self._given[column] = self.draws.shape[1] + len(columns) - 1
-                columns.append(values[:, column, None])
+                columns.append(scaled[:, column, None])
         self._mixture = _fitted(np.concatenate(columns, axis=1), rng)
-        self._slopes = self._slopes_of_priors(rng)
+        self._slopes = self._slopes_of_priors(y)
 
     @property
     def base(self) -> Array:
@@ -122,25 +135,25 @@ class Guide:
         absent = np.setdiff1d(np.arange(self.draws.shape[1]), has)
         mixture = self._mixture.conditioned(drawn, self._given[absent], self._values[absent])
         mixture = mixture.tilted(-self._slopes[~present].sum(axis=0)[drawn])
-        wider = mixture.with_wide_part(WIDE_WEIGHT, WIDE_SCALE)
+        wider = mixture.with_wide_parts(WIDE)
         blocks = np.isin(np.arange(len(unused_blocks)), self._density.blocks[unused])
-        return Proposal(present, drawn, unused, blocks, wider)
+        return Proposal(present, drawn, unused, blocks, wider, wider, self._coordinates)
 
-    def _slopes_of_priors(self, rng: np.random.Generator) -> Array:
-        """How the log prior densities of absent terms change with other variables, (K, k).
+    def _slopes_of_priors(self, y: Array) -> Array:
+        """How the log prior densities of absent terms change with other coordinates, (K, k).
 
-        By linear regression at some draws.
+        By linear regression on those of the draws (n, k). Conditioning a coordinate takes care of a
+        part of it.
         """
-        n = len(self._density.candidates)
-        x = self.draws[rng.permutation(len(self.draws))[:N_REGRESSED]]
-        seeds = self._density.fresh_seeds(len(x), rng)
-        held = self._density.evaluate(Point(x, np.zeros((len(x), n), dtype=bool), seeds)).held
+        log_prior = self._density.log_prior_held(self.draws) * (
+            1 - self._coordinates.power_of_values
+        )
+        slopes = np.zeros((len(self._density.candidates), y.shape[1]))
         columns = self._density.candidates.switches.columns
-        of_terms = [held[:, np.unique(self._density.blocks[one])].sum(axis=1) for one in columns]
-        slopes = np.zeros((n, x.shape[1]))
-        for slope, values in zip(slopes, of_terms, strict=True):
-            if np.isfinite(values).all() and np.ptp(values) > 0:
-                slope[:] = _slope(x, values)
+        for slope, values in zip(slopes, (log_prior[:, one] for one in columns), strict=True):
+            h = values.sum(axis=1)
+            if np.isfinite(h).all() and np.ptp(h) > 0:
+                slope[:] = _slope(y, h)
         return slopes
 
 
