@@ -67,6 +67,8 @@ class GivenRecord:
     def _own_times(self, records: Records | None) -> Any:
         """The times that are given, else the dates that the data bring."""
         found = times_of_data(self.observed)
+        for name in ("steps", "times", "panel"):
+            _check_index(name, getattr(self, name), self.observed)
         if self.steps is not None or self.times is not None:
             if found is not None:
                 _check_agree(self.times, found, records)
@@ -80,6 +82,19 @@ class GivenRecord:
         if found is None and self.observed is not None:
             raise ModelError("observed brings no dates: give steps or times")
         return found
+
+
+def _check_index(name: str, values: Any, observed: Any) -> None:
+    """Raise if tables have the same rows in another order, as they are taken by position."""
+    if not (isinstance(values, pd.Series) and isinstance(observed, pd.Series | pd.DataFrame)):
+        return
+    own, other = values.index, observed.index
+    if len(own) == len(other) and not own.equals(other) and own.isin(other).all():
+        raise ModelError(
+            f"{name} must have its rows in the order of observed, got the index "
+            f"{shortened(own.tolist())} beside {shortened(other.tolist())}: sort both alike, or "
+            "give arrays (.to_numpy())"
+        )
 
 
 def _check_agree(times: Any, dates: Any, records: Records | None) -> None:

@@ -430,6 +430,16 @@ def test_dates_of_the_data_are_those_of_the_times():
         checked_record(EXACT, GivenRecord(series[::-1], steps=np.arange(DATA.size)))
 
 
+def test_rows_of_tables_are_in_one_order():
+    table = pd.DataFrame({"time": TIMES[::-1], "y": DATA[::-1]})
+    in_order = table.sort_values("time")
+    found = checked_record(EXACT, GivenRecord(in_order["y"], times=in_order["time"]))
+    np.testing.assert_array_equal(found.observed[:, 0], DATA)
+    with pytest.raises(ModelError, match="times must have its rows in the order of observed"):
+        checked_record(EXACT, GivenRecord(table["y"], times=in_order["time"]))
+    checked_record(EXACT, GivenRecord(table["y"].to_numpy(), times=in_order["time"]))
+
+
 def test_an_index_without_dates_is_named():
     for index in (DATES.astype(str), None, pd.period_range("2020", periods=DATA.size, freq="M")):
         with pytest.raises(ModelError, match=r"brings no dates.*pd.to_datetime.*got the index"):
