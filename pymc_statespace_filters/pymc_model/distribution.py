@@ -171,7 +171,7 @@ class StateSpace(Continuous):
             row_coords: Any = record.clock.shown(record.axis.times(record.axis.steps))
         else:
             record = symbolic_panel(system, given)
-            values = {key: in_order_of_records(key, v, model, record) for key, v in values.items()}
+            values = in_order_of_records(system, values, model, record)
             theta = symbolic_panel_parameters(system, values, record, others)
             n_rows, t0 = int(np.diff(record.records.starts).max()), record.t0
             row_dim, component_dim = _dims(dims, f"{full_name}_obs")

@@ -1,5 +1,6 @@
 """Variables of a model with a dimension of records, in the order of a panel's rows."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -8,11 +9,14 @@ from pytensor.graph.basic import Variable
 
 from ..errors import ModelError
 from ..system.labels import positions_of
+from ..system.model import StateSpaceModel
 from ..system.panel import SymbolicPanel
 
 
-def in_order_of_records(parameter: str, value: Any, model: pm.Model, panel: SymbolicPanel) -> Any:
-    """The value of a parameter, aligned by the coordinates of its dimension, if it has them.
+def in_order_of_records(
+    system: StateSpaceModel, values: Mapping[str, Any], model: pm.Model, panel: SymbolicPanel
+) -> dict[str, Any]:
+    """Values of parameters; those of each record are aligned by the coordinates of the records.
 
     Coordinates that count from zero are none, unless the labels of the records do as well.
 
@@ -22,6 +26,17 @@ def in_order_of_records(parameter: str, value: Any, model: pm.Model, panel: Symb
         If the coordinates are not the labels of the records, or in another order where the records
         may be replaced.
     """
+    n_axes = {
+        name: len(shape)
+        for name, shape in zip(system.parameters, system.parameter_shapes, strict=True)
+    }
+    return {
+        name: _aligned(name, value, model, panel) if np.ndim(value) > n_axes[name] else value
+        for name, value in values.items()
+    }
+
+
+def _aligned(parameter: str, value: Any, model: pm.Model, panel: SymbolicPanel) -> Any:
     found, labels = _first_coordinates(value, model), panel.records.labels
     if found is None or found == labels:
         return value

@@ -61,6 +61,21 @@ def test_variables_of_a_model_are_aligned_with_the_records_by_their_dimension():
         in_model(["A", "C"])
 
 
+def test_a_vector_that_all_records_share_has_coordinates_of_its_own():
+    system = pair(
+        transition=lambda x, q, w: [w[0] * x[0] + w[1] * x[1] + q[0], 0.8 * x[1] + q[1]],
+        shapes={"w": (2,)},
+    )
+    with pm.Model(coords={"weight": ["own", "other"]}) as model:
+        pm.Normal("w", dims="weight")
+        psf.StateSpace(
+            "d", system, psf.EKF(), panel=np.repeat(["A", "B"], STEPS.size),
+            steps=np.tile(STEPS, 2), observed=np.tile(PAIR_DATA, (2, 1)),
+        )  # fmt: skip
+    (terms,) = model.compile_logp(model["d"], sum=False)({"w": np.array([0.5, 0.2])})
+    np.testing.assert_allclose(terms, np.tile(pair_terms(0.5), 2), rtol=1e-12, atol=1e-14)
+
+
 def test_the_order_of_records_that_may_be_replaced_is_that_of_the_rows():
     labels = pytensor.shared(np.repeat([7, 3], STEPS.size))
     in_model([7, 3], labels=labels)
