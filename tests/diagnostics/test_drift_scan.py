@@ -11,7 +11,11 @@ from scipy.stats import kstest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.diagnostics.constancy.axis import TimeAxis
 from pymc_statespace_filters.diagnostics.constancy.simulations import ConstancyTest, Statistics
-from pymc_statespace_filters.diagnostics.constancy.statistics import constancy, p_values
+from pymc_statespace_filters.diagnostics.constancy.statistics import (
+    _from_each_row,
+    constancy,
+    p_values,
+)
 from pymc_statespace_filters.diagnostics.constancy.table import _changes, _turns, sentences
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.pymc_model.term_scores import ScoredVariable
@@ -95,6 +99,11 @@ def test_statistic_is_the_derivative_by_the_variance_of_a_walk():
     # at a point that is no estimate the projection takes the sums of all scores away
     estimated = [variable.labels.index(name) for name in TRUE]
     np.testing.assert_allclose(found.remaining[0, 0, estimated], 0, atol=1e-5)
+
+
+def test_scores_of_a_panel_are_summed_within_each_record():
+    values, of_rows = np.arange(1.0, 7.0)[None, :, None], np.array([0, 0, 0, 1, 2, 2])
+    np.testing.assert_array_equal(_from_each_row(values, of_rows)[0, :, 0], [6, 5, 3, 4, 11, 6])
 
 
 def test_p_values_by_hand():
