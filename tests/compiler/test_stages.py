@@ -9,6 +9,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.errors import FilterWarning, LoweringError
 from pymc_statespace_filters.system import quantiles as law
+from tests.modes import AS_IT_STANDS
 
 M, N = 6, 131  # two blocks of members and a rest
 C = np.array([0.8])
@@ -58,7 +59,7 @@ def propagated(machine, X, Z):
 def test_a_step_is_that_of_the_interpreted_graph():
     X, Z = members()
     x, q, b = pt.vector("x"), pt.vector("q"), pt.scalar("b")
-    interpreted = pytensor.function([x, q, b], pt.stack(epidemic(x, q, b)), mode="FAST_COMPILE")
+    interpreted = pytensor.function([x, q, b], pt.stack(epidemic(x, q, b)), mode=AS_IT_STANDS)
     expected = [interpreted(X[:, i], Z[:, i], *C) for i in range(N)]
     got = propagated(compile_system(system(epidemic)), X, Z)
     np.testing.assert_array_equal(got.T, expected)

@@ -20,6 +20,7 @@ from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.pymc_model.random_variable import NUMBERS
 from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable, gaussian_predictions
+from tests.modes import AS_IT_STANDS
 
 STEPS = np.array([0, 3, 4, 9])
 OBSERVED = np.array([[0.5, -0.2], [np.nan, 0.4], [np.nan, np.nan], [0.1, 0.3]])
@@ -279,7 +280,7 @@ def test_predictions_have_the_noise_of_the_sensor_alone():
         system=KNOWN, filter=psf.EKF(), theta=pt.dvector(), **constants, **others
     )
     graphs = gaussian_predictions(variable)
-    _, mean, cov = (graph.eval({variable.theta: theta}, mode="FAST_COMPILE") for graph in graphs)
+    _, mean, cov = (graph.eval({variable.theta: theta}, mode=AS_IT_STANDS) for graph in graphs)
     x = path(theta)[STEPS]
     seen = np.column_stack([x[:, 0] + THETA["c"] * x[:, 1] ** 2, np.exp(0.3 * x[:, 1])])
     np.testing.assert_allclose(mean, seen, rtol=1e-12)

@@ -16,6 +16,7 @@ from pymc_statespace_filters.compiler.lowering.symbols import symbols_of
 from pymc_statespace_filters.system.distributions import SCALAR_LAWS, law_name
 from pymc_statespace_filters.testing import kalman_log_likelihood
 from tests.distributions import TABLE
+from tests.modes import AS_IT_STANDS
 from tests.systems import counts
 
 
@@ -40,7 +41,7 @@ def test_means_and_variances_are_those_of_scipy():
     mean, cov = pytensor.function(
         list(symbols.values()),
         conditional_moments(system, symbols),
-        mode="FAST_COMPILE",
+        mode=AS_IT_STANDS,
         on_unused_input="ignore",
     )(*(np.full(v.type.shape, 0.7) for v in symbols.values()))
     laws = [law for _, law in TABLE.values()]

@@ -22,6 +22,7 @@ from pymc_statespace_filters.ops.distributed import DistributedLogLikelihood
 from pymc_statespace_filters.ops.likelihood import LogLikelihoodOfNoise, StoredNoise
 from pymc_statespace_filters.ops.states import States
 from pymc_statespace_filters.testing import kalman_log_likelihood
+from tests.modes import AS_IT_STANDS
 from tests.ranks import on_ranks
 from tests.references.regimes import SwitchingSystem
 
@@ -411,7 +412,7 @@ def test_means_of_probabilities_are_those_of_a_grid(kind):
     drawn = [pt.constant(v) for v in hybrid.drawn]
     outputs = [*draws_of(hybrid, values, pt.zeros(1), s, drawn)[1]]
     outputs += [pytensor.grad(outputs[0], s)] if kind == "even" else []
-    given = pytensor.function([s], outputs, mode="FAST_COMPILE")
+    given = pytensor.function([s], outputs, mode=AS_IT_STANDS)
     gaussian = np.array([0.0, 0.0, 1.0, 0.3, 0.8])  # mean, lower triangle of the covariance
     weight, state, *slopes = given(gaussian)
     a, b = np.meshgrid(*[np.linspace(-6, 6, 600)] * 2)

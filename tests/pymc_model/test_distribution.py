@@ -9,6 +9,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
+from tests.modes import AS_IT_STANDS
 from tests.systems import (
     FORCE,
     FORCED,
@@ -40,7 +41,7 @@ def terms(variable):
     """The log-likelihood terms at fixed parameters, by PyTensor's reference linker."""
     model = pm.modelcontext(None)
     value = model.rvs_to_values[variable]
-    return pm.logp(variable, value).eval(mode="FAST_COMPILE")
+    return pm.logp(variable, value).eval(mode=AS_IT_STANDS)
 
 
 # Where parameters come from.

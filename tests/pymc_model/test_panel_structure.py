@@ -11,6 +11,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.pymc_model.panel_structure import panel_structure
+from tests.modes import AS_IT_STANDS
 
 LABELS = ["a", "b", "c"]
 N_ROWS = 4
@@ -22,6 +23,7 @@ SYSTEM = psf.StateSpaceModel(
     initial_mean=[0.0],
     initial_cov=[[1.0]],
 )
+
 DATA = np.linspace(-1.0, 1.0, 3 * N_ROWS)
 
 
@@ -161,8 +163,8 @@ def check_terms(model, found):
     if found.other_likelihood is not None:
         graphs.append(found.other_likelihood)
     # Too few calls to be worth machine code.
-    whole = model.compile_fn(model.logp(), mode="FAST_COMPILE")
-    terms = model.compile_fn(graphs, mode="FAST_COMPILE", on_unused_input="ignore")
+    whole = model.compile_fn(model.logp(), mode=AS_IT_STANDS)
+    terms = model.compile_fn(graphs, mode=AS_IT_STANDS, on_unused_input="ignore")
     rng = np.random.default_rng(1)
     point = {
         name: value + 0.2 * rng.normal(size=np.shape(value))

@@ -17,6 +17,7 @@ from pymc_statespace_filters.pymc_model.step_refinement import (
 )
 from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.record import checked_record
+from tests.modes import AS_IT_STANDS
 
 OBSERVED = {"observation": lambda x: [x[0]], "observation_noise": [[0.1]]}
 
@@ -125,7 +126,7 @@ def test_a_model_with_an_integrator_of_a_user_is_refined(runge_kutta):
         psf.StateSpace("d", system, psf.EKF(), steps=[10, 20], observed=[0.4, 0.2])
     assert list(step_stability(model)(np.array([[-1.0], [-29.0]]))) == [True, False]
     coarse, fine = pytensor.function(
-        [model.rvs_to_values[a]], list(densities_by_steps(model)), mode="FAST_COMPILE"
+        [model.rvs_to_values[a]], list(densities_by_steps(model)), mode=AS_IT_STANDS
     )(-1.0)
     assert 0 < abs(coarse - fine) < 0.05
 
@@ -192,7 +193,7 @@ def test_halved_steps_of_a_record_at_any_times(filter):
 
     coarse = model(1)
     found = [
-        pytensor.function(coarse.value_vars, one, mode="FAST_COMPILE")(1.3)
+        pytensor.function(coarse.value_vars, one, mode=AS_IT_STANDS)(1.3)
         for one in densities_by_halvings(coarse, 1)
     ]
     at = {"a": 1.3}

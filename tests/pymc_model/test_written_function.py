@@ -14,6 +14,7 @@ from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunc
 from pymc_statespace_filters.pymc_model.density import ModelDensity, compile_raveled
 from pymc_statespace_filters.pymc_model.inspection import health_outputs, noise_seeds
 from pymc_statespace_filters.pymc_model.written_function import WrittenFunction, native_function
+from tests.modes import AS_IT_STANDS
 from tests.systems import autoregression
 
 SYSTEM = autoregression(spread=0.5**0.5)
@@ -157,7 +158,7 @@ def test_gradients(panel):
     function, start = with_gradient(model)
     written = native_function(function, [start])
     assert isinstance(written, WrittenFunction)
-    truth, _ = with_gradient(model, mode="FAST_COMPILE")
+    truth, _ = with_gradient(model, mode=AS_IT_STANDS)
     position = start.copy()
     bound, _ = written.bind([position])
     rng = np.random.default_rng(2)

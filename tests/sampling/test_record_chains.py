@@ -10,6 +10,7 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from tests.kernels import with_kernel
+from tests.modes import AS_IT_STANDS
 
 # The state is white noise about a level, so that a record is a sample of independent normals and
 # the posterior of levels and mean, given the other variances, is Gaussian.
@@ -22,6 +23,7 @@ SYSTEM = psf.StateSpaceModel(
     initial_mean=[0.0],
     initial_cov=[[1.0]],
 )
+
 LABELS, N_ROWS = ["left", "middle", "right"], 3
 NOISY = psf.BootstrapPF(64)
 
@@ -111,7 +113,7 @@ def test_the_estimate_of_each_draw_is_that_of_its_seeds():
     model = panel_model(NOISY)
     idata = chains(model, 40, 40, chains=1)
     posterior, stats = idata["posterior"].isel(chain=0), idata["sample_stats"].isel(chain=0)
-    prior = model.compile_fn(model.logp(vars=model.free_RVs), mode="FAST_COMPILE")
+    prior = model.compile_fn(model.logp(vars=model.free_RVs), mode=AS_IT_STANDS)
     data = data_of(3).reshape(3, N_ROWS)
     for draw in (0, 20, 39):
         levels = posterior["level"].values[draw]

@@ -9,6 +9,7 @@ import pytest
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.forces import cubic, freeplay, hysteresis, hysteresis_branch
+from tests.modes import AS_IT_STANDS
 
 pytestmark = pytest.mark.usefixtures("interpreted")
 
@@ -56,7 +57,7 @@ def force(request):
             value = FORCES[request.param](z, width)
             for _ in range(order):
                 value = pytensor.grad(value.sum(), z)
-            compiled[width, order] = pytensor.function([z], value, mode="FAST_COMPILE")
+            compiled[width, order] = pytensor.function([z], value, mode=AS_IT_STANDS)
         return compiled[width, order](np.asarray(displacements))
 
     return evaluate
@@ -109,7 +110,7 @@ def test_remembered_force_is_continuous_and_takes_out_full_loops_only():
     z, b = pt.dscalar("z"), pt.dscalar("b")
     force = hysteresis(z, b, STIFFNESS, START, LENGTH)
     kept = hysteresis_branch(z, b, START, LENGTH)
-    step = pytensor.function([z, b], [force, kept], mode="FAST_COMPILE")
+    step = pytensor.function([z, b], [force, kept], mode=AS_IT_STANDS)
     end, density = START + LENGTH, 200
     turns = np.array([0.0, 0.8, -0.7, 0.9, -end - 0.5, end + 0.5, 0.0]) * density
     path = np.concatenate([np.arange(a, o, np.sign(o - a)) for a, o in itertools.pairwise(turns)])
@@ -166,8 +167,8 @@ def test_every_parameter_has_a_gradient():
     names = ("z", "v", "k_h", "a_h", "delta_h")
     symbols = [pt.dscalar(name) for name in names]
     value = hysteresis(*symbols, width=0.3)
-    gradients = pytensor.function(symbols, pytensor.grad(value, symbols), mode="FAST_COMPILE")
-    evaluate = pytensor.function(symbols, value, mode="FAST_COMPILE")
+    gradients = pytensor.function(symbols, pytensor.grad(value, symbols), mode=AS_IT_STANDS)
+    evaluate = pytensor.function(symbols, value, mode=AS_IT_STANDS)
     point, step = np.array([0.5, 1.0, STIFFNESS, START, LENGTH]), 1e-6
     central = [
         (evaluate(*(point + step * axis)) - evaluate(*(point - step * axis))) / (2 * step)

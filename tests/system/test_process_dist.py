@@ -14,6 +14,7 @@ from pymc_statespace_filters.compiler.lowering.compiled_system import compile_sy
 from pymc_statespace_filters.compiler.lowering.symbols import call
 from pymc_statespace_filters.system.distributions import LAWS, law_name
 from tests.distributions import TABLE
+from tests.modes import AS_IT_STANDS
 
 SHARES = np.array([0.2, 0.5, 0.3])
 COV = np.array([[2.0, 0.6], [0.6, 0.5]])
@@ -103,8 +104,8 @@ def test_the_surrogate_has_mean_and_covariance(everything):
     x = pt.tensor("x", shape=(30,), dtype="float64")
     step = call(gaussian.equations.transition, gaussian, {"theta": pt.zeros((0,)), "x": x, "q": z})
     at = {x: np.r_[0.7, np.zeros(29)], z: np.zeros(everything.m)}
-    mean = step.eval(at, mode="FAST_COMPILE")
-    jac = jacobian(step, z, vectorize=True).eval(at, mode="FAST_COMPILE")
+    mean = step.eval(at, mode=AS_IT_STANDS)
+    jac = jacobian(step, z, vectorize=True).eval(at, mode=AS_IT_STANDS)
     laws = [law for _, law in TABLE.values()]
     np.testing.assert_allclose(mean[:20], [law.mean() for law in laws], rtol=1e-7)
     cov = jac @ jac.T
