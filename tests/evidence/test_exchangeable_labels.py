@@ -12,7 +12,11 @@ from scipy.stats import norm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning
-from pymc_statespace_filters.evidence.exchangeable_labels import exchangeable_labels
+from pymc_statespace_filters.evidence.exchangeable_labels import (
+    Axis,
+    _features,
+    exchangeable_labels,
+)
 
 DATA = np.array([-2.1, -1.6, -2.4, -1.9, -2.2, 1.8, 2.3, 1.7, 2.0, 2.6])
 ORDERED = pm.distributions.transforms.ordered
@@ -108,6 +112,22 @@ def test_three_labels_of_which_two_change_places():
         pm.Potential("likelihood", pt.prod(mean) * 1e-3)
     (labels,) = exchangeable_labels(model, idata, np.zeros((2, 500)), rng)
     assert labels.lacking == pytest.approx(np.log(3))
+
+
+def test_two_of_three_labels_alone_may_not_be_exchanged():
+    rng = np.random.default_rng(3)
+    mu = rng.standard_normal((2, 50, 3))
+    idata = xr.DataTree.from_dict({"posterior": xr.Dataset({"mu": (("chain", "draw", "k"), mu)})})
+    with pm.Model() as model:
+        mean = pm.Normal("mu", 0, 5, shape=3)
+        pm.Potential("likelihood", mean[0] * mean[1] + mean[2])
+    assert not exchangeable_labels(model, idata, np.zeros((2, 50)), rng)
+
+
+def test_a_matrix_says_of_a_label_what_is_on_its_diagonal():
+    draws = {"P": np.arange(8.0).reshape(2, 2, 2), "mean": np.array([[8.0, 9.0], [10.0, 11.0]])}
+    found = _features(draws, [Axis("P", 0), Axis("P", 1), Axis("mean", 0)])
+    np.testing.assert_array_equal(found, [[[0, 8], [3, 9]], [[4, 10], [7, 11]]])
 
 
 def regimes(filter):
