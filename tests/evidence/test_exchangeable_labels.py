@@ -15,6 +15,7 @@ from pymc_statespace_filters.errors import EvidenceWarning
 from pymc_statespace_filters.evidence.exchangeable_labels import (
     Axis,
     _features,
+    _log_visited,
     exchangeable_labels,
 )
 
@@ -112,6 +113,13 @@ def test_three_labels_of_which_two_change_places():
         pm.Potential("likelihood", pt.prod(mean) * 1e-3)
     (labels,) = exchangeable_labels(model, idata, np.zeros((2, 500)), rng)
     assert labels.lacking == pytest.approx(np.log(3))
+
+
+def test_labels_that_change_places_in_pairs_visit_four_orders():
+    of_labels = np.array([-5.0, -5.1, 5.0, 5.1]) + 0.3 * np.random.default_rng(3).normal(
+        size=(800, 4)
+    )
+    assert _log_visited(of_labels[:, :, None], 0) == pytest.approx(np.log(4))
 
 
 def test_two_of_three_labels_alone_may_not_be_exchanged():

@@ -9,6 +9,7 @@ import pytensor
 import pytensor.tensor as pt
 import pytest
 import xarray as xr
+from numba import njit
 from scipy.stats import multivariate_normal
 
 import pymc_statespace_filters as psf
@@ -17,6 +18,7 @@ from pymc_statespace_filters.compiler.lowering.symbols import symbols_of
 from pymc_statespace_filters.errors import FilterWarning, ModelError
 from pymc_statespace_filters.filters.regimes.draws import draws_of
 from pymc_statespace_filters.filters.regimes.hybrid import hybrid_of
+from pymc_statespace_filters.filters.regimes.moments import _row_of_cov
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.distributed import DistributedLogLikelihood
 from pymc_statespace_filters.ops.likelihood import LogLikelihoodOfNoise, StoredNoise
@@ -314,6 +316,18 @@ def test_variances_between_few_particles_are_unbiased():
     mean = (w * regimes).sum(axis=1)
     variance = (w * (regimes - mean[:, None]) ** 2).sum(axis=1) / (1 - (w**2).sum(axis=1))
     np.testing.assert_allclose(run["sd"].sel(state="regime"), np.sqrt(variance), atol=1e-12)
+
+
+def test_covariances_of_a_part_are_the_rows_of_a_lower_triangle():
+    """Behind two finite states and three means."""
+
+    @njit
+    def row(i, j):
+        return _row_of_cov(5, 2, 2 + i, 2 + j)
+
+    pairs = list(zip(*np.tril_indices(3), strict=True))
+    assert [row(i, j) for i, j in pairs] == [row(j, i) for i, j in pairs] == [5, 6, 7, 8, 9, 10]
+    assert row(-1, 1) == -1
 
 
 def test_the_gradient_is_that_of_the_value():
