@@ -111,6 +111,7 @@ GROUPS = {
         "plot_model_probabilities",
         "plot_prequential",
         "plot_prior_sensitivity",
+        "plot_terms",
         "plot_average",
     ),
     "Errors and warnings": (

@@ -46,6 +46,7 @@ from .plots import (
     plot_prior_sensitivity,
     plot_residuals,
     plot_states,
+    plot_terms,
 )
 from .point_estimation import maximum_likelihood
 from .pymc_model.distribution import StateSpace
@@ -139,6 +140,7 @@ __all__ = [
     "plot_prior_sensitivity",
     "plot_residuals",
     "plot_states",
+    "plot_terms",
     "prior_sensitivity",
     "reweight",
     "run_filter",

@@ -11,6 +11,7 @@ from .prequential import plot_prequential
 from .prior_sensitivity import plot_prior_sensitivity
 from .residuals import plot_residuals
 from .states import plot_states
+from .terms import plot_terms
 
 __all__ = [
     "plot_average",
@@ -25,4 +26,5 @@ __all__ = [
     "plot_prior_sensitivity",
     "plot_residuals",
     "plot_states",
+    "plot_terms",
 ]

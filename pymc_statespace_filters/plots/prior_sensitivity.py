@@ -26,7 +26,8 @@ def plot_prior_sensitivity(
     Parameters
     ----------
     curves : xarray.Dataset
-        The result of `prior_sensitivity`, or the attribute ``widths`` of that of `drift_evidence`.
+        The result of `prior_sensitivity`, the attribute ``widths`` of that of `drift_evidence`, or
+        the group ``widths`` of that of `select_terms`, by its ``to_dataset()``.
         The label of the axis names the priors that were left out, or because of which the panel is
         empty. A curve has no points where the draws do not determine the result; an empty panel
         tells why.
@@ -105,7 +106,8 @@ def _label_axes(collection: PlotCollection, probs: xr.Dataset) -> None:
     }
     text = "width of the priors (factor)" + _about_priors(probs)
     collection.map(labelled_x, text=text, **settings)
-    collection.map(labelled_y, text="probability of the model", **settings)
+    of_what = f"probability of the {probs.attrs.get('width_of', 'model')}"
+    collection.map(labelled_y, text=of_what, **settings)
     collection.map(set_ylim, limits=(-0.02, 1.02), **settings)
     if probs["width_prob"].isnull().all():
         ends = probs["width"].values[[0, -1]]

@@ -120,28 +120,26 @@ class SwitchedDensity(RowFunction):
         found, own, held = self.calls(np.concatenate([x, is_on], axis=1), *seeds.T)
         return DensityInParts(np.where(np.isnan(found), -np.inf, found), own, held)
 
-    def held_priors(self) -> "HeldPriors":
-        """The densities of what is held, where all switches are off, without the likelihood."""
-        return HeldPriors(self.model, self._graphs)
+    def priors(self) -> "SwitchedPriors":
+        """The priors of the blocks, without the likelihood."""
+        return SwitchedPriors(self.model, self._graphs)
 
     def constrained(self, variables: Sequence[TensorVariable]) -> "SwitchedValues":
         """Variables of the model as functions of a point and its switches."""
         return SwitchedValues(self._graphs, variables)
 
 
-class HeldPriors(RowFunction):
-    """The log-densities of all blocks at the values at which they are held, given the others."""
+class SwitchedPriors(RowFunction):
+    """The priors of all blocks, without the likelihood: see `DensityInParts`."""
 
     def __init__(self, model: pm.Model, graphs: "_SwitchedGraphs") -> None:
-        self._n_switches = graphs.n_switches
-        held = graphs.held_terms
-        super().__init__(model, held.sum(), [held], point=graphs.point)
+        terms = [graphs.own_terms, graphs.held_terms]
+        super().__init__(model, graphs.own_terms.sum(), terms, point=graphs.point)
 
-    def at(self, x: Array) -> Array:
-        """At points x (m, k), shape (m, blocks)."""
-        off = np.zeros((len(x), self._n_switches))
+    def in_parts(self, x: Array, is_on: NDArray[np.bool_]) -> DensityInParts:
+        """At points x (m, k) with switches (m, K)."""
         seeds = np.broadcast_to(self.model_seeds, (len(x), self.model_seeds.size))
-        return self.calls(np.concatenate([x, off], axis=1), *seeds.T)[1]
+        return DensityInParts(*self.calls(np.concatenate([x, is_on], axis=1), *seeds.T))
 
 
 class SwitchedValues:

@@ -7,9 +7,10 @@ import numpy as np
 import pymc as pm
 from numpy.typing import NDArray
 from pytensor.graph.traversal import ancestors
+from pytensor.tensor.variable import TensorVariable
 
 from ..pymc_model.inspection import element_names
-from ..pymc_model.switched_density import DensityInParts, HeldPriors, SwitchedDensity
+from ..pymc_model.switched_density import DensityInParts, SwitchedDensity, SwitchedPriors
 from .candidates import Candidates
 
 BLOCK = 50_000  # points that are evaluated in one call
@@ -44,10 +45,15 @@ class SubmodelDensity:
         self.candidate_of = candidates.switches.number_of(len(self.density.blocks))
 
     @cached_property
+    def variables(self) -> list[TensorVariable]:
+        """The free variable of every column."""
+        return [self.model[name.partition("[")[0]] for name in element_names(self.model)]
+
+    @cached_property
     def scaled_columns(self) -> Columns:
         """Those of candidates whose priors depend on free variables that are no candidates."""
         model = self.model
-        names = [name.partition("[")[0] for name in element_names(model)]
+        names = [rv.name for rv in self.variables]
         own = {names[column] for one in self.candidates.switches.columns for column in one}
         depends = []
         for rv in model.free_RVs:
@@ -64,13 +70,15 @@ class SubmodelDensity:
         """
         found = np.zeros_like(x)
         if (scaled := self.scaled_columns).size:
-            held = self._prior_held.at(x)
+            absent = np.zeros((len(x), len(self.candidates)), dtype=bool)
+            held = self.priors.in_parts(x, absent).held
             found[:, scaled] = held[:, self.blocks[scaled]]
         return found
 
     @cached_property
-    def _prior_held(self) -> HeldPriors:
-        return self.density.held_priors()
+    def priors(self) -> SwitchedPriors:
+        """The priors alone."""
+        return self.density.priors()
 
     @property
     def blocks(self) -> Columns:

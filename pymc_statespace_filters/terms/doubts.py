@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import ModelError
 from .candidates import Candidates
@@ -28,12 +29,19 @@ def check_finite(points: Sequence[Weighted], candidates: Candidates) -> None:
             )
 
 
+def unreliable(found: Probabilities, points: Sequence[Weighted]) -> NDArray[np.bool_]:
+    """Which sub-models that matter have evidences whose errors cannot be believed, (S,)."""
+    poor = found.of_models > NEGLIGIBLE
+    for i in np.flatnonzero(poor).tolist():
+        poor[i] = not points[i].is_reliable
+    return np.asarray(poor)
+
+
 def doubts(
     found: Probabilities, points: Sequence[Weighted], candidates: Candidates
 ) -> Iterator[str]:
     """Why the errors of inclusions may be too small."""
-    counts = found.of_models > NEGLIGIBLE
-    poor = np.array([not one.is_reliable for one in points]) & counts
+    poor = unreliable(found, points)
     share = float(found.of_models[poor].sum())
     if share > MAX_SHARE:
         worst = int(np.argmax(np.where(poor, found.of_models, -1.0)))

@@ -24,7 +24,7 @@ N_PILOT, GOOD = 200, 0.25  # points that judge a proposal; effective points per 
 N_REFITS = 5
 FEWEST = 100  # points of a sub-model within reach
 LARGE, ENOUGH = 0.01, 1000  # such an influence, and the points of such a sub-model at least
-TARGET_SE = 0.005  # of an inclusion
+TARGET_SE, NOISY_SE = 0.005, 0.01  # of an inclusion; with likelihoods that are estimates
 N_ROUNDS, MOST_POINTS = 6, 50_000  # of points that are added to reach it
 
 Announce = Callable[[str, int], None]
@@ -118,9 +118,10 @@ def _until_certain(
 ) -> list[Weighted]:
     """Add points until the inclusions have the error that is aimed at."""
     points, left = list(found), MOST_POINTS
+    target = NOISY_SE if sampler.is_noisy else TARGET_SE
     for _ in range(N_ROUNDS):
         known = probabilities(points, sets, log_prior)
-        more = np.minimum(_missing(known, [one.count for one in points]), left)
+        more = np.minimum(_missing(known, [one.count for one in points], target), left)
         chosen = np.flatnonzero(more * [len(one.x) for one in points])
         if not chosen.size:
             break
@@ -164,12 +165,12 @@ def _least(known: Probabilities) -> np.ndarray:
     return np.ceil(ENOUGH * np.minimum(known.influence() / LARGE, 1.0)).astype(np.int64)
 
 
-def _missing(known: Probabilities, counts: Sequence[int]) -> np.ndarray:
+def _missing(known: Probabilities, counts: Sequence[int], target: float) -> np.ndarray:
     """How many points each sub-model lacks, (S,); at most as many as all have now."""
     n = np.array(counts)
     spread = np.where(np.isfinite(known.error), known.error, 0.0) * np.sqrt(n)
     share = known.influence() * spread
-    needed = np.maximum(share * share.sum() / TARGET_SE**2, _least(known))
+    needed = np.maximum(share * share.sum() / target**2, _least(known))
     missing = np.maximum(np.ceil(needed - n), 0)
     scale = min(1.0, n[share > 0].sum() / max(missing.sum(), 1.0))
     return np.ceil(scale * missing).astype(np.int64)

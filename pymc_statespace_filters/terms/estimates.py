@@ -118,6 +118,11 @@ class Sampler:
         self._density, self._base, self._pool, self._rng = density, base, pool, rng
         self.n_evaluations = 0
 
+    @property
+    def is_noisy(self) -> bool:
+        """Whether likelihoods are estimates."""
+        return bool(self._density.density.seed_names)
+
     def is_free(self, proposals: Sequence[Proposal]) -> NDArray[np.bool_]:
         """Whether densities are the same for all values of what is taken for unused."""
         points = [one.sample(1, self._base, self._pool, self._rng)[0] for one in proposals]

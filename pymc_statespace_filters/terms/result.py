@@ -5,13 +5,16 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
+from ..evidence.comparison.prior_sensitivity import width_factors
 from ..pymc_model.inspection import filters_used
 from .candidates import Candidates
 from .density import Array, Sets, SubmodelDensity
 from .draws import Averaged, posterior_of
 from .estimates import Weighted
 from .probabilities import Probabilities
+from .widths import inclusion_by_width
 
+LEAST_SHOWN = 1e-4  # probability of a sub-model whose weights are looked at
 COPIED = ("observed_data", "constant_data")
 
 
@@ -34,6 +37,7 @@ def as_datatree(
     groups = {
         "terms": _terms(found, prior, density.candidates),
         "models": _models(found, points, prior, density.candidates, order),
+        "widths": inclusion_by_width(found, points, density, width_factors(None)),
         "posterior": posterior_of(drawn, found.present, density, like),
         "sample_stats": _stats(drawn, number, density, like),
     }
@@ -72,7 +76,7 @@ def _models(
         "prior": prior,
         "n_evaluations": np.array([one.count for one in points]),
         "n_effective": np.array([one.n_effective for one in points]),
-        "pareto_k": np.array([one.pareto_k for one in points]),
+        "pareto_k": np.array([_tail(*each) for each in zip(points, found.of_models, strict=True)]),
     }
     present: Sets = found.present[order]
     return xr.Dataset(
@@ -80,6 +84,11 @@ def _models(
         | {name: ("model", values[order]) for name, values in by_model.items()},
         coords={"model": np.arange(len(order)), "term": candidates.labels},
     )
+
+
+def _tail(one: Weighted, probability: float) -> float:
+    """The tail of the weights, unless the sub-model is far too improbable to matter."""
+    return one.pareto_k if probability > LEAST_SHOWN else np.nan
 
 
 def _stats(

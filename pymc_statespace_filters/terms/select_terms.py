@@ -80,6 +80,11 @@ def select_terms(
         error ``se``, ``prior``, and of the points behind it the number ``n_evaluations``, the
         effective number ``n_effective`` and the tail of their weights, ``pareto_k``.
 
+        ``widths`` : the probabilities of inclusion for slabs that are all wider or narrower by a
+        factor, about the values at which the terms vanish; ``plot_prior_sensitivity`` draws it.
+        NaN where the points do not determine it. With ever wider slabs every term loses its
+        probability (Lindley's paradox): what a result needs is a slab that means something.
+
         ``posterior`` : draws averaged over the sub-models, with all variables of the full model.
         Where a draw lacks a term, its variables have the values of ``absent``. ``sample_stats`` has
         the sub-model of each draw, and the noise seed of its likelihood.

@@ -6,6 +6,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from scipy.special import betaln, logsumexp
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
@@ -117,9 +118,7 @@ def test_what_only_an_absent_term_uses_has_its_prior():
     rng = np.random.default_rng(0)
     prior = {"k": np.abs(rng.normal(size=(2, 300))), "gap": rng.beta(2, 5, size=(2, 300))}
     prior |= {"level": 0.2 + 0.2 * rng.normal(size=(2, 300))}
-    idata = xr.DataTree.from_dict(
-        {"posterior": xr.Dataset({k: (("chain", "draw"), v) for k, v in prior.items()})}
-    )
+    idata = draws_of_values(prior)
     found = psf.select_terms(model, {"k": 0.0}, idata=idata, random_seed=1, progressbar=False)
     models = found["models"]
     without = ~models["present"].values[:, 0]
@@ -204,11 +203,8 @@ def test_a_wrong_argument_is_named(absent, settings, message):
 
 def draws_of(**values):
     rng = np.random.default_rng(1)
-    posterior = {
-        name: (("chain", "draw"), mean + 0.2 * rng.standard_normal((2, 100)))
-        for name, mean in values.items()
-    }
-    return xr.DataTree.from_dict({"posterior": xr.Dataset(posterior)})
+    noisy = {name: mean + 0.2 * rng.standard_normal((2, 100)) for name, mean in values.items()}
+    return draws_of_values(noisy)
 
 
 def test_two_candidates_of_one_term_are_named():
@@ -237,3 +233,57 @@ def test_elements_with_a_joint_density_are_refused():
         psf.select_terms(model, {"b[0]": 0.0}, idata=draws_of(mu=0.7), progressbar=False)
     with pytest.raises(ModelError, match="name them one by one"):
         psf.select_terms(model, {"b": 0.0}, idata=draws_of(mu=0.7), progressbar=False)
+
+
+def test_slabs_of_other_widths():
+    regression, curves = few_terms(), few_selected()["widths"].to_dataset()
+    size = regression.sets.sum(axis=1)
+    for width in (0.25, 0.5, 1.0, 2.0, 4.0):
+        evidence = [regression.log_evidence_given(one, width) for one in regression.sets]
+        logs = np.array(evidence, dtype=float) + betaln(size + 1, 5 - size)
+        truth = np.exp(logs - logsumexp(logs)) @ regression.sets
+        found = curves.sel(width=width, method="nearest")
+        assert (np.abs(found["width_prob"] - truth) < 4 * found["width_se"] + 1e-9).all()
+    assert curves.attrs["width_left_out"] == ""
+    psf.plot_prior_sensitivity(curves, backend="none")
+
+
+def test_noisy_likelihoods_have_the_evidences_of_exact_ones():
+    system = psf.StateSpaceModel(
+        transition=lambda x, q, u, a, b: [a * x[0] + b * u[0] + q[0]],
+        process_noise=[[0.2]],
+        observation=lambda x: [x[0]],
+        observation_noise=[[0.3]],
+        initial_mean=[0.0],
+        initial_cov=[[0.1]],
+        inputs=["force"],
+    )
+    force = np.cos(np.arange(16))
+    truth = {"a": 0.5, "b": 0.3}
+    record = psf.simulate(system, truth, steps=range(1, 16), inputs=force, random_seed=3)
+    rng = np.random.default_rng(0)
+    a, b = 0.4 + 0.2 * rng.normal(size=(2, 2, 300))
+    found = []
+    for filter in (psf.EKF(), psf.BootstrapPF(64)):
+        with pm.Model() as model:
+            pm.Normal("a", 0, 1)
+            pm.Normal("b", 0, 1)
+            psf.StateSpace(
+                "y", system, filter, steps=range(1, 16), inputs=force,
+                observed=record["observations"],
+            )  # fmt: skip
+        idata = draws_of_values({"a": a, "b": b})
+        absent = {"a": 0.0, "b": 0.0}
+        found.append(psf.select_terms(model, absent, idata=idata, random_seed=1, progressbar=False))
+    (exact, _), (noisy, se) = (
+        [one["terms"][name].values for name in ("inclusion", "inclusion_se")] for one in found
+    )
+    assert (np.abs(noisy - exact) < 4 * np.hypot(se, 0.002)).all()
+    assert (se < 0.02).all()
+    seeds = found[1]["sample_stats"]["y_seed"].values
+    assert len(np.unique(seeds)) > 100
+
+
+def draws_of_values(values):
+    posterior = {name: (("chain", "draw"), one) for name, one in values.items()}
+    return xr.DataTree.from_dict({"posterior": xr.Dataset(posterior)})

@@ -1,0 +1,110 @@
+"""Plot of the probabilities of terms, from `select_terms`."""
+
+import math
+from typing import Any
+
+import xarray as xr
+from arviz_plots import PlotCollection
+from arviz_plots.visuals import labelled_x, line_x, scatter_x, set_xlim
+
+from ..errors import ModelError
+from .canvas import (
+    add_legend,
+    annotate,
+    canvas_of_rows,
+    format_probability,
+    interval,
+    legend_style,
+)
+from .evidence import ends
+
+STYLE = {"color": "C0"}
+PRIOR = {"color": "B3", "width": 2}
+NEEDED = {"inclusion", "inclusion_se", "prior_inclusion"}
+N_ERRORS = 2
+
+
+def plot_terms(
+    found: xr.DataTree, *, backend: str | None = None, **pc_kwargs: Any
+) -> PlotCollection:
+    """Plot the probability of every term with two standard errors, and its prior probability.
+
+    The most probable term is on top. A probability above its prior speaks for a term, and the
+    median-probability model has those above one half. How they depend on the width of the slabs is
+    drawn by ``plot_prior_sensitivity(found["widths"].to_dataset())``.
+
+    Parameters
+    ----------
+    found : xarray.DataTree
+        The result of `select_terms`.
+    backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
+        Default: ``arviz.rcParams["plot.backend"]``.
+    **pc_kwargs
+        Passed to ``arviz_plots.PlotCollection.wrap``.
+
+    Returns
+    -------
+    arviz_plots.PlotCollection
+        Visuals ``prior``, ``interval``, ``point``, ``text``, ``x_label``.
+
+    Raises
+    ------
+    ModelError
+        If `found` is something else.
+
+    Examples
+    --------
+    >>> import xarray as xr
+    >>> from pymc_statespace_filters import plot_terms
+    >>> terms = xr.Dataset(
+    ...     {
+    ...         "inclusion": ("term", [0.98, 0.12]),
+    ...         "inclusion_se": ("term", [0.002, 0.01]),
+    ...         "prior_inclusion": ("term", [0.5, 0.5]),
+    ...     },
+    ...     coords={"term": ["k3", "c2"]},
+    ... )
+    >>> collection = plot_terms(xr.DataTree.from_dict({"terms": terms}))
+    >>> collection.savefig("terms.png")  # doctest: +SKIP
+    """
+    terms = _terms(found)
+    points = terms[["inclusion"]]
+    error = N_ERRORS * terms["inclusion_se"]
+    bounds = interval((points - error).clip(0, 1), (points + error).clip(0, 1))
+    prior = terms[["prior_inclusion"]].rename(prior_inclusion="inclusion")
+    collection = canvas_of_rows(points, backend=backend, pc_kwargs=pc_kwargs)
+    collection.map(ends, "prior", data=interval(prior, prior), **PRIOR)
+    collection.map(line_x, "interval", data=bounds, width=2, **STYLE)
+    collection.map(scatter_x, "point", **STYLE)
+    texts = xr.apply_ufunc(
+        _text,
+        terms["inclusion"],
+        terms["inclusion_se"],
+        vectorize=True,
+        output_dtypes=[object],
+    )
+    collection.map(annotate, "text", texts=texts, middle=0.5, color="B2")
+    collection.map(set_xlim, ignore_aes="all", limits=(-0.02, 1.02), store_artist=False)
+    collection.map(labelled_x, "x_label", ignore_aes="all", text="probability of the term")
+    legend = {"probability, two standard errors": legend_style(STYLE), "prior": PRIOR}
+    add_legend(collection, legend)
+    return collection
+
+
+def _terms(found: xr.DataTree) -> xr.Dataset:
+    """The terms, most probable first."""
+    is_tree = isinstance(found, xr.DataTree) and "terms" in found.children
+    if not is_tree or not set(found["terms"].data_vars) >= NEEDED:
+        raise ModelError(
+            f"found must be the result of select_terms, got {type(found).__name__}"
+            + (f" with the groups {sorted(found.children)}" if is_tree else "")
+        )
+    terms = found["terms"].to_dataset()[sorted(NEEDED)]
+    return terms.isel(term=(-terms["inclusion"]).argsort(kind="stable").values)
+
+
+def _text(probability: float, error: float) -> str:
+    if not 0 < error < math.inf or not 0.01 <= probability <= 0.99:
+        return format_probability(probability)
+    digits = min(max(2, math.ceil(-math.log10(error))), 4)
+    return f"{probability:.{digits}f} ± {error:.{digits}f}"
