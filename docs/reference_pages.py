@@ -94,6 +94,7 @@ GROUPS = {
         "prior_sensitivity",
         "drift_evidence",
         "select_terms",
+        "relevance",
         "step_error",
         "reweight",
         "chib_jeliazkov",

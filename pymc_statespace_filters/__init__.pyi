@@ -76,6 +76,7 @@ from .system.panel_frame import panel_from
 from .system.stationary import stationary
 from .system.steps import nearest_steps
 from .terms import select_terms
+from .terms.relevance import relevance
 
 __version__: str
 
@@ -142,6 +143,7 @@ __all__ = [
     "plot_states",
     "plot_terms",
     "prior_sensitivity",
+    "relevance",
     "reweight",
     "run_filter",
     "run_models",

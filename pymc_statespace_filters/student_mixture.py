@@ -9,7 +9,7 @@ the tails (Hesterberg 1995).
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp
 
 DEGREES_OF_FREEDOM = 5.0
+NORMAL = 1e8  # degrees of freedom with which a component is a normal distribution
 N_STEPS, MIN_STEP = 200, 1e-3  # EM iterations; smallest gain in nats per draw
 ROUNDING = 1e-10  # of the largest eigenvalue, the least one of a conditional scale matrix
 WIDE_WEIGHT, WIDE_SCALE = 0.1, 1.5  # of the defensive component; scale in those of the draws
@@ -31,6 +32,7 @@ class StudentMixture:
     weights: Array  # (J,)
     means: Array  # (J, k)
     chols: Array  # (J, k, k), lower factors of the scale matrices
+    degrees: float = DEGREES_OF_FREEDOM
 
     def log_density(self, x: Array) -> Array:
         """Log-density at points x (m, k), shape (m,)."""
@@ -38,7 +40,7 @@ class StudentMixture:
 
     def log_joint(self, x: Array) -> Array:
         """Log-density of each component times its weight at x (m, k), shape (J, m)."""
-        nu, k = DEGREES_OF_FREEDOM, x.shape[-1]
+        nu, k = self.degrees, x.shape[-1]
         log_det = np.log(np.diagonal(self.chols, axis1=1, axis2=2)).sum(axis=1)
         constant = gammaln((nu + k) / 2) - gammaln(nu / 2) - 0.5 * k * math.log(nu * math.pi)
         tail = 0.5 * (nu + k) * np.log1p(self.squared_distances(x) / nu)
@@ -53,22 +55,23 @@ class StudentMixture:
         """Draw independent points, shape (count, k)."""
         component = rng.choice(len(self.weights), size=count, p=self.weights)
         normals = rng.standard_normal((count, self.means.shape[-1]))
-        spread = np.sqrt(DEGREES_OF_FREEDOM / rng.chisquare(DEGREES_OF_FREEDOM, count))
+        spread = np.sqrt(self.degrees / rng.chisquare(self.degrees, count))
         moves = np.einsum("mij,mj->mi", self.chols[component], normals)
         return self.means[component] + spread[:, None] * moves
 
     def with_defensive_component(self) -> "StudentMixture":
         """Add a component wider than the standardised draws."""
         k = self.means.shape[-1]
-        return StudentMixture(
-            np.append((1 - WIDE_WEIGHT) * self.weights, WIDE_WEIGHT),
-            np.concatenate([self.means, np.zeros((1, k))]),
-            np.concatenate([self.chols, WIDE_SCALE * np.eye(k)[None]]),
+        return replace(
+            self,
+            weights=np.append((1 - WIDE_WEIGHT) * self.weights, WIDE_WEIGHT),
+            means=np.concatenate([self.means, np.zeros((1, k))]),
+            chols=np.concatenate([self.chols, WIDE_SCALE * np.eye(k)[None]]),
         )
 
     def widened(self, scale: float) -> "StudentMixture":
         """The same with wider components."""
-        return StudentMixture(self.weights, self.means, scale * self.chols)
+        return replace(self, chols=scale * self.chols)
 
     def conditioned(
         self, kept: NDArray[np.int64], given: NDArray[np.int64], values: Array
@@ -84,10 +87,10 @@ class StudentMixture:
         gain = scales[:, kept][:, :, given] @ np.linalg.inv(marginal)
         means = self.means[:, kept] + np.einsum("jab,jb->ja", gain, gap)
         left = scales[:, kept][:, :, kept] - gain @ scales[:, given][:, :, kept]
-        there = StudentMixture(self.weights, self.means[:, given], np.linalg.cholesky(marginal))
+        there = replace(self, means=self.means[:, given], chols=np.linalg.cholesky(marginal))
         log_weights = there.log_joint(values[None])[:, 0]
         weights = np.exp(log_weights - logsumexp(log_weights))
-        return StudentMixture(weights, means, _factors(left))
+        return replace(self, weights=weights, means=means, chols=_factors(left))
 
     def tilted(self, slope: Array) -> "StudentMixture":
         """Near the law of a density that is this one times exp(slope x), with slope (k,).
@@ -98,7 +101,7 @@ class StudentMixture:
         moves = np.einsum("jab,jb->ja", self.chols, roots)
         log_weights = np.log(self.weights) + self.means @ slope + 0.5 * (roots**2).sum(axis=1)
         weights = np.exp(log_weights - logsumexp(log_weights))
-        return StudentMixture(weights, self.means + moves, self.chols)
+        return replace(self, weights=weights, means=self.means + moves)
 
     def with_wide_parts(self, parts: Mapping[float, float]) -> "StudentMixture":
         """A mixture of this one and wider copies of it, of these scales with these weights."""
@@ -110,15 +113,16 @@ class StudentMixture:
 
     def mixed_with(self, other: "StudentMixture", weight: float) -> "StudentMixture":
         """A mixture of this one and another, which has this weight."""
-        return StudentMixture(
-            np.concatenate([(1 - weight) * self.weights, weight * other.weights]),
-            np.concatenate([self.means, other.means]),
-            np.concatenate([self.chols, other.chols]),
+        return replace(
+            self,
+            weights=np.concatenate([(1 - weight) * self.weights, weight * other.weights]),
+            means=np.concatenate([self.means, other.means]),
+            chols=np.concatenate([self.chols, other.chols]),
         )
 
     def affine(self, mean: Array, chol: Array) -> "StudentMixture":
         """The distribution of mean + chol x."""
-        return StudentMixture(self.weights, mean + self.means @ chol.T, chol @ self.chols)
+        return replace(self, means=mean + self.means @ chol.T, chols=chol @ self.chols)
 
 
 class Standardised(NamedTuple):
@@ -176,7 +180,7 @@ def fit_mixture(x: Array, mixture: StudentMixture) -> StudentMixture:
 
 def _m_step(mixture: StudentMixture, x: Array, responsibilities: Array) -> StudentMixture:
     """Maximisation step of EM, given the responsibilities (J, n) of the components."""
-    nu, k = DEGREES_OF_FREEDOM, x.shape[-1]
+    nu, k = mixture.degrees, x.shape[-1]
     # Draws in the tail of a component get little weight.
     weighted = responsibilities * (nu + k) / (nu + mixture.squared_distances(x))
     sizes = responsibilities.sum(axis=1)
@@ -186,4 +190,4 @@ def _m_step(mixture: StudentMixture, x: Array, responsibilities: Array) -> Stude
     # Regularise by k + 1 pseudo-draws of covariance one, that of all standardised draws.
     scales = (scatter + (k + 1) * np.eye(k)) / (sizes + k + 1)[:, None, None]
     weights = (sizes + 1) / (sizes + 1).sum()
-    return StudentMixture(weights, means, np.linalg.cholesky(scales))
+    return replace(mixture, weights=weights, means=means, chols=np.linalg.cholesky(scales))
