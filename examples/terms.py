@@ -13,8 +13,8 @@ degree three, ten for each equation; seven are there. The script compares
 * a regularised horseshoe (Piironen and Vehtari 2017), a prior that shrinks small coefficients,
   sampled by NUTS.
 
-and writes ``out/terms.csv``. ``--quick`` has degree two, six candidates for each equation and two
-hundred rows; the cubic term is then missing, as it may be in any library.
+and writes ``out/terms.csv``. ``--quick`` has the linear candidates only, three for each equation,
+and a hundred rows; the cubic term is then missing, as it may be in any library.
 """
 
 import argparse
@@ -33,7 +33,6 @@ TRUTH = {
     "b": {"1": 0.056, "v": 0.08, "w": -0.064},
 }
 NOISE = 0.1
-PRESENT = 0.5  # probability, or weight that is left by shrinkage
 
 
 def neuron(terms) -> psf.StateSpaceModel:
@@ -150,7 +149,7 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--no-progressbar", dest="progressbar", action="store_false")
     args = parser.parse_args(argv)
     if args.quick:
-        args.rows, args.degree, args.draws, args.chains = 200, 2, 300, 2
+        args.rows, args.degree, args.draws, args.chains = 100, 1, 200, 2
     return args
 
 

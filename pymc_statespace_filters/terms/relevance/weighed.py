@@ -84,8 +84,10 @@ class TermDensity:
         for _ in range(N_REFITS + 1):
             points, log_weights = self._points(proposals, sd, rng)
             found = _weighed(log_weights, points[:, : (sd > 0).sum()], sd)
+            if not any(found.doubts()):
+                break
             fit = flattened_copy(points, log_weights, rng, N_COMPONENTS)
-            if not any(found.doubts()) or not fit:
+            if not fit:
                 break
             proposals = fit[0].with_wide_parts({WIDE_SCALE: WIDE_WEIGHT})
         return found

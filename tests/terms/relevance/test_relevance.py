@@ -5,17 +5,19 @@ import pymc as pm
 import pytest
 import xarray as xr
 from scipy.optimize import minimize
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, norm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.importance import normalised, systematic
 from pymc_statespace_filters.terms.relevance import weighed
+from tests.systems import FREE
 
 N, SD, NAMES = 40, 0.5, ["b[0]", "b[1]", "b[2]"]
 RNG = np.random.default_rng(8)
 DESIGN = RNG.standard_normal((N, 3))
 Y = DESIGN @ [0.6, 0.2, 0.0] + SD * RNG.standard_normal(N)
+DATA = [1.9, 2.4, 0.2, 1.6, 2.3, 3.1, 1.0, -0.6, 0.9, 0.1, -1.7, -2.0]
 PRIORS = {
     "normal": lambda: pm.Normal("b", [0.0, 0.1, 0.0], 1.5, shape=3),
     "flat": lambda: pm.Flat("b", shape=3),
@@ -101,6 +103,26 @@ def test_a_subset_of_the_coefficients_leaves_the_other_priors():
     cov = SD**2 * np.eye(N) + np.ones((N, N)) + 1.5**2 * DESIGN[:, :2] @ DESIGN[:, :2].T
     expected = multivariate_normal(0.1 * DESIGN[:, 1], cov).logpdf(Y)
     assert abs(table.log_evidence - expected) < 4 * table.log_evidence_se < 0.1
+
+
+@pytest.mark.parametrize("filter", [psf.EKF(), psf.BootstrapPF(64)], ids=["exact", "noisy"])
+def test_the_evidence_of_a_state_space_model_is_its_integral(filter):
+    with pm.Model() as model:
+        pm.Normal("a", 0, 1)
+        psf.StateSpace("d", FREE, filter, steps=range(12), observed=DATA)
+    grid = np.linspace(-3, 3, 601)
+    params = {"a": grid}
+    log_likelihood = psf.log_likelihood(FREE, psf.EKF(), params, DATA, steps=range(12)).sum(-1)
+    weights = normalised(log_likelihood + norm.logpdf(grid))
+    a = np.random.default_rng(5).choice(grid, p=weights, size=(4, 500))
+    idata = xr.DataTree.from_dict({"posterior": xr.Dataset({"a": (("chain", "draw"), a)})})
+    table = psf.relevance(idata, model, "a", random_seed=6, progressbar=False)
+    sd = table.loc["a", "prior_sd"]
+    integrand = np.exp(log_likelihood) * norm.pdf(grid, scale=sd)
+    assert abs(table.log_evidence - np.log(integrand.sum() * 0.01)) < 4 * table.log_evidence_se
+    gain = table.log_evidence - log_likelihood[300]
+    assert abs(table.loc["a", "gain"] - gain) < 4 * table.loc["a", "gain_se"]
+    assert table.log_evidence_se < 0.05
 
 
 def test_a_gain_that_the_points_do_not_determine_is_unknown(monkeypatch):
