@@ -37,13 +37,13 @@ class InclusionPrior:
 
     Attributes
     ----------
-    log_odds : ndarray (K,) or None
-        Of independent candidates; None for the beta-binomial prior.
+    probability : ndarray (K,) or None
+        Of independent candidates, zero and one included; None for the beta-binomial prior.
     needed : ndarray of bool (K, K)
         Which others (columns) a candidate (row) requires.
     """
 
-    log_odds: Array | None
+    probability: Array | None
     needed: Sets
 
     def permits(self, present: Sets) -> NDArray[np.bool_]:
@@ -53,16 +53,26 @@ class InclusionPrior:
 
     def log_weight(self, present: Sets) -> Array:
         """The log-probability of permitted sets (..., K), up to a constant."""
-        if self.log_odds is not None:
-            return np.asarray(present @ self.log_odds)
+        if self.probability is not None:
+            with np.errstate(divide="ignore"):
+                log_p, log_not = np.log(self.probability), np.log1p(-self.probability)
+            return np.asarray(np.where(present, log_p, log_not).sum(axis=-1))
         n, size = present.shape[-1], present.sum(axis=-1)
         return np.asarray(betaln(size + 1, n - size + 1))
 
+    @property
+    def is_open(self) -> NDArray[np.bool_]:
+        """Which candidates may be present or absent, (K,)."""
+        p = np.full(len(self.needed), 0.5) if self.probability is None else self.probability
+        return np.asarray((p > 0) & (p < 1))
+
     def all_sets(self) -> Sets:
-        """All permitted sets, (S, K)."""
-        n = len(self.needed)
-        every = (np.arange(2**n)[:, None] >> np.arange(n)) & 1
-        present = every.astype(bool)
+        """All permitted sets of positive probability, (S, K)."""
+        n = int(self.is_open.sum())
+        present = np.zeros((2**n, len(self.needed)), dtype=bool)
+        present[:, self.is_open] = (np.arange(2**n)[:, None] >> np.arange(n)) & 1
+        if self.probability is not None:
+            present[:, self.probability == 1] = True
         return np.asarray(present[self.permits(present)])
 
     def probabilities(self, present: Sets) -> Array:
@@ -72,31 +82,26 @@ class InclusionPrior:
 
 def read_inclusion(candidates: Candidates, inclusion: Any, requires: Any) -> InclusionPrior:
     """Check the arguments ``inclusion`` and ``requires`` of `select_terms`."""
-    return InclusionPrior(_log_odds(candidates, inclusion), _needed(candidates, requires))
+    return InclusionPrior(_probabilities(candidates, inclusion), _needed(candidates, requires))
 
 
-def _log_odds(candidates: Candidates, inclusion: Any) -> Array | None:
+def _probabilities(candidates: Candidates, inclusion: Any) -> Array | None:
     if isinstance(inclusion, str) and inclusion == BETA_BINOMIAL:
         return None
     if isinstance(inclusion, Mapping):
         numbers = [candidates.number(key, "inclusion") for key in inclusion]
         if missing := [key for i, key in enumerate(candidates.keys) if i not in numbers]:
             raise ModelError(f"inclusion must have a probability for every candidate: {missing}")
-        given = [_probability(inclusion[key], key) for key in candidates.keys]
-    else:
-        given = [_probability(inclusion)] * len(candidates)
-    p = np.array(given)
-    return np.asarray(np.log(p) - np.log1p(-p))
-
-
-def _probability(value: Any, key: Any = None) -> float:
-    if is_finite(value) and 0 < value < 1:
-        return float(value)
-    of_key = "" if key is None else f" for {key!r}"
-    raise ModelError(
-        f"inclusion must be {BETA_BINOMIAL!r}, a probability between 0 and 1, or a dictionary from "
-        f"candidates to such probabilities, got {value!r}{of_key}"
-    )
+        for key, value in inclusion.items():
+            if not is_finite(value) or not 0 <= value <= 1:
+                raise ModelError(f"inclusion must be from 0 to 1 for {key!r}, got {value!r}")
+        return np.array([float(inclusion[key]) for key in candidates.keys])
+    if not is_finite(inclusion) or not 0 < inclusion < 1:
+        raise ModelError(
+            f"inclusion must be {BETA_BINOMIAL!r}, a probability between 0 and 1, or a dictionary "
+            f"from candidates to probabilities, got {inclusion!r}"
+        )
+    return np.full(len(candidates), float(inclusion))
 
 
 def _needed(candidates: Candidates, requires: Any) -> Sets:

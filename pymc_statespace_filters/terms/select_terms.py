@@ -59,7 +59,8 @@ def select_terms(
     inclusion : "beta-binomial", float or mapping
         Prior of the sub-models. ``"beta-binomial"``: each number of terms is as probable as any
         other, and so are all sets of one size. A number: the probability of each term,
-        independently of the others; or such a number for each candidate.
+        independently of the others; or such a number for each candidate, where 0 is always absent
+        and 1 always present, as in the attribute ``inclusion`` of the table of `relevance`.
     requires : mapping, optional
         For a candidate another one, or a list of them, without which it is not considered:
         ``{"k3": "k1"}``. The prior is restricted to the sub-models that remain.
@@ -140,10 +141,10 @@ def select_terms(
     model = given_model(model)
     candidates = read_candidates(model, absent)
     prior = read_inclusion(candidates, inclusion, requires)
-    if len(candidates) > MOST_CANDIDATES:
+    if (n_open := int(prior.is_open.sum())) > MOST_CANDIDATES:
         raise ModelError(
-            f"absent must have at most {MOST_CANDIDATES} candidates, got {len(candidates)}: "
-            "tuples of terms that come and go together count once"
+            f"absent must have at most {MOST_CANDIDATES} candidates, got {n_open}: tuples of terms "
+            "that come and go together count once, and those of inclusion 0 or 1 not at all"
         )
     rng = check_random_seed(random_seed)
     if idata is None:

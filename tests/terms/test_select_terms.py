@@ -84,6 +84,20 @@ def test_priors_of_inclusion_and_requirements():
     np.testing.assert_array_equal(terms["median_model"], terms["inclusion"] > 0.5)
 
 
+def test_terms_of_certain_presence_or_absence_are_not_compared():
+    regression = few_terms()
+    inclusion = dict(zip(regression.absent, [1.0, 0.5, 0.0, 0.3], strict=True))
+    found = selected(regression, inclusion=inclusion)
+    present = found["models"]["present"].values
+    assert len(present) == 4
+    assert present[:, 0].all()
+    assert not present[:, 2].any()
+    truth = in_order(found, regression, regression.log_evidence)
+    weight = np.exp(truth - truth.max()) * np.where(present[:, 3], 0.3, 0.7)
+    np.testing.assert_allclose(found["models"]["probability"], weight / weight.sum(), atol=0.02)
+    assert found["terms"]["inclusion"].values[[0, 2]].tolist() == [1.0, 0.0]
+
+
 def test_draws_are_averaged_over_sub_models():
     regression, found = few_terms(), few_selected()
     present = found["models"]["present"].values[found["sample_stats"]["model"].values]
@@ -188,6 +202,7 @@ def test_states_of_averaged_draws():
         ({"b0": 0.0, ("b0", "b1"): (0.0, 0.0)}, {}, "every scalar once, got 'b0'"),
         ({3: 0.0}, {}, "got 3"),
         ({"b0": 0.0}, {"inclusion": 1.0}, "inclusion must be .* got 1.0"),
+        ({"b0": 0.0}, {"inclusion": {"b0": 1.5}}, "from 0 to 1 for 'b0', got 1.5"),
         ({"b0": 0.0}, {"inclusion": {"b1": 0.5}}, "inclusion must name candidates"),
         ({"b0": 0.0, "b1": 0.0}, {"inclusion": {"b1": 0.5}}, "for every candidate"),
         ({"b0": 0.0}, {"requires": {"b0": "b0"}}, "for itself"),
