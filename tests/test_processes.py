@@ -77,24 +77,29 @@ SCRIPT = """
 import json, sys
 import numpy as np, pymc as pm
 import pymc_statespace_filters as psf
+from pytensor.link.numba.cache import NUMBA_CACHE_PATH
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.native import entry_point as entries
 from pymc_statespace_filters.ops.unplanned import cache_key
 from tests.systems import FORCE, FORCED_DATA, STEPS, forced
 
-results = []
-for system, observed in json.loads(sys.argv[1]):
+def terms(system, observed):
     with pm.Model() as model:
         pm.Normal("a", 0.5, 0.2)
         psf.StateSpace(
             "d", forced(**system), psf.EKF(), steps=STEPS, observed=observed, inputs=FORCE
         )
-    results.append(model.compile_logp([model["d"]], sum=False)({"a": np.array(0.6)})[0].tolist())
+    return model.compile_logp([model["d"]], sum=False)({"a": np.array(0.6)})[0].tolist()
+
+first, *others = json.loads(sys.argv[1])
 record = dict(observed=FORCED_DATA, steps=STEPS, inputs=FORCE)
-value = psf.log_likelihood(forced(), psf.EnKF(20), {"a": 0.6}, **record).tolist()
-key = cache_key(forced(), psf.EnKF(20).compile(compile_system(forced())))
+values = [
+    terms(*first), psf.log_likelihood(forced(), psf.EnKF(20), {"a": 0.6}, **record).tolist(),
+    cache_key(forced(), psf.EnKF(20).compile(compile_system(forced()))),
+]
 found = [entry.cache_hits for entry in entries._compiled.values()]
-print(json.dumps([results, value, key, found]))
+files = sorted(path.name for path in NUMBA_CACHE_PATH.rglob("*.nb[ci]"))
+print(json.dumps([values, found, files, [terms(*other) for other in others]]))
 """
 
 
@@ -115,8 +120,7 @@ def run(tmp_path):
             check=False,
         )
         assert done.returncode == 0, done.stderr
-        machine_code = {p for p in cache.rglob("*") if p.suffix in {".nbc", ".nbi"}}
-        return *json.loads(done.stdout), machine_code
+        return json.loads(done.stdout)
 
     return run
 
@@ -124,19 +128,19 @@ def run(tmp_path):
 def test_machine_code_is_found_again_and_never_mixed_up(run):
     """A second process compiles nothing; other data and constants meet what the first one kept."""
     data, other_data = FORCED_DATA.tolist(), (2 * FORCED_DATA).tolist()
-    *cold, found, machine_code = run([{}, data])
+    cold, found, machine_code, _ = run([{}, data])
     terms, _, key = cold
     assert machine_code
     assert len(found) > 3
     assert not any(found)
-    np.testing.assert_allclose(terms, [forced_terms(0.6)], rtol=1e-12)
+    np.testing.assert_allclose(terms, forced_terms(0.6), rtol=1e-12)
 
-    *warm, found_again, same_machine_code = run([{}, data])
+    warm, found_again, same_machine_code, others = run(
+        [{}, data], [{}, other_data], [{"observation_noise": [[0.6]]}, data]
+    )
     assert same_machine_code == machine_code
     assert found_again == [1] * len(found)
     assert key == cache_key(FORCED, psf.EnKF(20).compile(compile_system(FORCED)))
     assert warm == cold
-
-    others, *_ = run([{}, other_data], [{"observation_noise": [[0.6]]}, data])
     exact = [forced_terms(0.6, other_data), forced_terms(0.6, observation_noise=0.6)]
     np.testing.assert_allclose(others, exact, rtol=1e-12)

@@ -269,6 +269,8 @@ def test_many_points_are_those_of_one_rank():
 def test_an_error_in_an_evaluation_ends_all(evaluate, rank, monkeypatch):
     """Of a follower's the leader learns as MPI lets it: here by the barrier, else by the abort."""
     fail_on(rank, monkeypatch)
+    # The followers, in the midst of the evaluation, do not answer.
+    monkeypatch.setattr(leader_follower, "_ANSWER_SECONDS", 0.2)
     with pytest.raises(Unlucky, match=f"on rank {rank}"):
         on_ranks(3, lambda ranks: led(ranks, evaluate, ranks))
 
