@@ -283,3 +283,9 @@ def test_one_that_varies_is_to_be_mended_before_others_are_believed():
     assert "noise varies: if it is one jump, it rises by about 0.0013" in second
     assert advice.startswith("Begin with level: ")
     assert len(sentences(table.iloc[1:], 99)) == 2
+    table["time"] = pd.date_range("2024-05-01", periods=3, freq="30h")
+    _, first, second, _ = sentences(table, 99)
+    assert first.endswith("before the row at 2024-05-01.")
+    assert second.endswith("before the row at 2024-05-02 06:00:00.")
+    _, first, *_ = sentences(table.assign(time=[1234.3 + 0.2, 1.0, 2.0]), 99)
+    assert first.endswith("before the row at 1234.5.")

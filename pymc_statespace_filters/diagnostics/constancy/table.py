@@ -48,7 +48,11 @@ class DriftScan(SentenceTable):
 def _text(name: str, value: Any) -> str:
     if name.startswith("p_"):
         return f"{value:.3f}"
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+    if isinstance(value, pd.Timestamp) and value == value.normalize():
+        return str(value.date())
+    if isinstance(value, float):
+        return f"{value:g}" if name == "time" else f"{value:.3g}"
+    return str(value)
 
 
 def scan_table(found: Statistics, labels: list[str], axis: TimeAxis) -> DriftScan:
@@ -123,7 +127,7 @@ def sentences(table: pd.DataFrame, n_simulated: int) -> list[str]:
         size = float(f"{abs(row['change']):.2g}")  # 240, not 2.4e+02
         found.append(
             f"{name} varies: if it is one jump, it {way} by about {size:g} before the row at "
-            f"{row['time']}{where}."
+            f"{_text('time', row['time'])}{where}."
         )
     if len(varying) > 1:
         found.append(
