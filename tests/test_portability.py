@@ -14,7 +14,11 @@ import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.compiler.numerics.normals import fill_normals
+from pymc_statespace_filters.compiler.numerics.philox import PROCESS
 from tests.elsewhere import PLAIN
+from tests.filters.test_kernel_density import log_density
 from tests.waiting import LIMIT
 
 ROOT = Path(__file__).parents[1]
@@ -49,7 +53,7 @@ def test_without_what_linux_has():
 def numbers():
     """What is written in vectors, or in instructions that not every processor has.
 
-    A scalar recursion; and a loop over members with normals, and densities in vectors of four.
+    A scalar recursion; members moved by normals; and their kernel density in vectors of four.
     """
     system = psf.StateSpaceModel(
         transition=lambda x, q, a: [a * pt.sin(x[0]) + pt.tanh(x[0] - 1.0) + q[0]],
@@ -60,8 +64,14 @@ def numbers():
         initial_cov=[[0.2]],
     )
     record = {"steps": np.arange(1, 31), "observed": np.exp(0.3 * np.sin(np.arange(30.0)))}
-    filters = psf.EKF(), psf.PFEnKF(64)
-    return np.array([psf.log_likelihood(system, f, {"a": 1.3}, **record, seed=2) for f in filters])
+    terms = psf.log_likelihood(system, psf.EKF(), {"a": 1.3}, **record)
+    machine, X, Z = compile_system(system), np.linspace(-2.0, 2.0, 64)[None], np.empty((1, 64))
+    fill_normals(2, PROCESS, 0, Z)
+    machine.propagate.function(
+        machine.prepare.function(np.array([1.3])), np.zeros((1, 0)), 0, 0.0, Z, X
+    )
+    density = log_density(X, np.full(64, 1 / 64), X + 0.1)
+    return np.concatenate([terms, Z[0], X[0], density])
 
 
 def test_machine_code_of_another_processor():
