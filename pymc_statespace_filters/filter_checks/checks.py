@@ -99,6 +99,27 @@ def check_model(
     return pd.DataFrame(rows)
 
 
+def doubt_at(
+    model: pm.Model,
+    name: str,
+    filter: Filter,
+    draws: Array,
+    *,
+    n_points: int,
+    seconds: float,
+    rng: np.random.Generator,
+) -> str | None:
+    """What is wrong with a filter of a variable at draws (n, k) of the unconstrained space, if so.
+
+    See `check_model`.
+    """
+    if not _needs_check(state_space_nodes(model)[name].op.system, filter):
+        return None
+    with np.errstate(invalid="ignore"):
+        findings = _check_variable(model, name, filter, draws, n_points, Budget(seconds), rng)
+    return next((one.verdict for one in findings if one.outcome == OFF), None)
+
+
 def _plain_row(filter: Filter) -> Finding:
     name = short_form(filter)
     if filter.noisy:

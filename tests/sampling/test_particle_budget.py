@@ -311,6 +311,21 @@ def linear_model_of_phi():
     return model
 
 
+def test_estimates_that_are_off_whatever_their_variance_are_doubted(monkeypatch):
+    """The sensor loses the sign, which an ensemble of normal members does not."""
+    monkeypatch.setattr(particle_budget, "search", lambda measure, first, target: [measure(60)])
+    squared = autoregression(spread=1.0, observation=lambda x: [x[0] ** 2])
+    observed = simulated(STEPS, 5, phi=0.9, spread=1.0, observation_noise=0.0) ** 2
+    with pm.Model() as model:
+        pm.Uniform("phi")
+        params = {"observation_noise": 0.1}
+        settings = {"steps": STEPS, "observed": observed, "params": params}
+        psf.StateSpace("d", squared, psf.EnKF(60), **settings)
+    with pytest.warns(FilterWarning, match=r"d: .*EnKF\(\d+\) is .* nats .*Use ") as caught:
+        psf.suggest_particles(model, random_seed=1, progressbar=False)
+    assert len(caught) == 1
+
+
 @pytest.mark.slow
 def test_a_variance_that_stays_warns_and_leaves_a_table():
     """A precise sensor far from where the particles start: one of them decides at once."""

@@ -17,9 +17,9 @@ from ...filters.protocol import Filter
 from ...pymc_model.inspection import observes_state_space
 from ...pymc_model.posterior_draws import MIN_DRAWS
 
-_N_POINTS = 20
+N_POINTS = 20
 # CPU seconds: so many, or this share of the time of the run if that is more.
-_LEAST_SECONDS, _SHARE = 2.0, 0.1
+LEAST_SECONDS, _SHARE = 2.0, 0.1
 # Runs of fewer iterations are trials.
 _LEAST_ITERATIONS = 600
 
@@ -64,8 +64,8 @@ def check_filters(
             tree,
             model,
             filter=filter,
-            n_points=_N_POINTS,
-            seconds=max(_LEAST_SECONDS, _SHARE * seconds),
+            n_points=N_POINTS,
+            seconds=max(LEAST_SECONDS, _SHARE * seconds),
             rng=rng,
         )
     except StateSpaceFiltersError as error:

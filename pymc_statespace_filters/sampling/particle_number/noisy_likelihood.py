@@ -7,6 +7,7 @@ import numpy as np
 from pymc.model import Model
 
 from ...errors import ModelError
+from ...filter_checks.checks import doubt_at
 from ...filters.protocol import Filter, properties
 from ...pymc_model.aligned_axes import records_of_rows
 from ...pymc_model.density import RowFunction
@@ -20,6 +21,7 @@ from ...pymc_model.inspection import (
 )
 from ...pymc_model.panel_structure import panel_structure
 from ..kernel.state import draw_seeds
+from ..output.filter_check import LEAST_SECONDS, N_POINTS
 from ..output.likelihood_variance import TOO_NOISY, SeedSpread, spread_of
 from ..target.target import Target
 from ..target.variables import RaveledVariables, continuous_value_vars
@@ -63,6 +65,7 @@ class NoisyLikelihood:
     ):
         self.name, self.filter = noisy_variable(model, var_name)
         self.pilot_is_complete = True
+        self._draws: np.ndarray | None = None  # of the pilot
         self._model, self._rng, self._effort = model, rng, effort
         self._seeds = noise_seeds(model)
         self._point = model.initial_point(random_seed=0)
@@ -84,7 +87,7 @@ class NoisyLikelihood:
             filter = quiet or resized(filter, round(n * min(variance, _PILOT_GROWTH)))
             pilot = self._pilot(filter, centre, _SECOND_SHARE)
             centre, _ = self._best(filter, pilot)
-        self.pilot_is_complete = pilot.is_complete
+        self.pilot_is_complete, self._draws = pilot.is_complete, pilot.positions
         tail = [int(np.argmin(np.abs(pilot.fractions - f))) for f in _TAIL_FRACTIONS]
         return centre, [pilot.positions[i] for i in dict.fromkeys(tail)]
 
@@ -114,6 +117,17 @@ class NoisyLikelihood:
             with self._effort.compilation(what):
                 self._densities[filter] = self._compiled(filter)
         return self._densities[filter]
+
+    def doubt(self, n_particles: int) -> str | None:
+        """What a check at the pilot's draws finds wrong with the estimates beside their noise."""
+        if self._draws is None:
+            return None
+        filter = resized(self.filter, n_particles)
+        self._effort.announce("Check of the filter", 1)
+        return doubt_at(
+            self._model, self.name, filter, self._draws, n_points=N_POINTS, seconds=LEAST_SECONDS,
+            rng=self._rng,
+        )  # fmt: skip
 
     def _compiled(self, filter: Filter) -> RowFunction:
         logp = self._model.logp()

@@ -100,6 +100,7 @@ def suggest_particles(
         tail; if time is up, or the user interrupts (Ctrl-C) when a number has been measured; if
         1000 particles or more are needed for a fiftieth of the observations. It names the
         observations that carry the variance, and a filter with less noise if the system allows one.
+        If the estimates are off whatever their variance, as `check_filter` finds.
 
     Notes
     -----
@@ -118,7 +119,8 @@ def suggest_particles(
     not tried.
 
     The number of particles changes the variance, and for EnKF and PFEnKF also the bias, which a
-    small variance does not exclude.
+    small variance does not exclude: the suggested number is compared with exact or unbiased filters
+    at draws of the pilot, in two seconds.
 
     References
     ----------
@@ -155,6 +157,7 @@ def suggest_particles(
     effort = Effort(check_positive("max_seconds", max_seconds))
     likelihood = NoisyLikelihood(model, var_name, check_random_seed(random_seed), effort)
     measurement = Measurement(likelihood, effort, target)
+    doubt = None
     with row_progress(effort, enabled=progressbar, patience=0.0) as announce:
         effort.announce = announce
         try:
@@ -162,6 +165,7 @@ def suggest_particles(
             rows = search(measurement.measure, likelihood.filter.size(), target)
             row, problem = choose(rows, target)
             found = _Suggestion(row.n_particles, row, row, problem)
+            doubt = likelihood.doubt(row.n_particles)
         except (OutOfTimeError, KeyboardInterrupt) as reason:
             rows = sorted(measurement.rows.values())
             if not rows:
@@ -173,7 +177,8 @@ def suggest_particles(
             cut = "the pilot was cut to keep max_seconds, so that the centre may be off"
             found = found._replace(problem=cut)
         advice = measurement.advice(found.basis, found.n_particles, found.problem)
-    if text := ". ".join([found.problem, *advice] if found.problem else advice):
+    said = [text for text in (found.problem, *advice, doubt) if text]
+    if text := ". ".join(said):
         warnings.warn(f"{likelihood.name}: {text}", FilterWarning, stacklevel=2)
     return _table(rows, found, measurement.noisiest_at(found.basis))
 
