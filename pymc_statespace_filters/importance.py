@@ -3,14 +3,15 @@
 A mean of weights has a standard error; the tail of the weights says whether that error holds, and
 their effective number how many equal weights they are worth. Weighted points become draws by
 resampling.
+
+ArviZ's statistics are imported where they are used: with SciPy's, which they load, they take a
+third of the time to import a sampler.
 """
 
 import math
 from typing import NamedTuple
 
 import numpy as np
-from arviz_stats import mcse
-from arviz_stats.base import array_stats
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import chdtri, log_expit, logsumexp, stdtrit
@@ -55,6 +56,8 @@ def mcse_of_chains(terms: Array) -> float:
     for a mean is their standard deviation over the root of their number, by as much wider as
     Student's interval of so few chains is wider than the normal one.
     """
+    from arviz_stats import mcse
+
     pooled, n_chains = float(mcse(terms, method="mean")), len(terms)
     if n_chains < 2:
         return pooled
@@ -71,6 +74,8 @@ def disagreement(log_terms: Array) -> str:
     R-hat is that of the ranks (Vehtari, Gelman, Simpson, Carpenter and Buerkner 2021), thus of the
     terms as of their logarithms.
     """
+    from arviz_stats.base import array_stats
+
     with np.errstate(invalid="ignore"):  # of equal terms it is 0 / 0
         found = float(array_stats.rhat(log_terms, chain_axis=0, draw_axis=1, method="rank"))
     if not found > MAX_RHAT:
@@ -110,6 +115,8 @@ def smoothed(log_weights: Array, r_eff: float = 1.0) -> tuple[Array, float]:
     and k is -inf. ``r_eff`` is the effective over the actual number of draws. Source: Vehtari,
     Simpson, Gelman, Yao and Gabry 2024, J. Mach. Learn. Res. 25(72), 1-58.
     """
+    from arviz_stats.base import array_stats
+
     # ArviZ does not accept infinities.
     finite = np.maximum(log_weights, log_weights.max() - NEGLIGIBLE)
     n_tail = math.ceil(min(0.2 * finite.size, 3 * finite.size**0.5))

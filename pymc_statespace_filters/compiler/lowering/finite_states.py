@@ -75,10 +75,6 @@ class FiniteStates:
     step: Moves
     unbounded: tuple[int, ...]
 
-    def values_of(self, i: int) -> np.ndarray:
-        """The values of the finite state number ``i`` of the system, sorted."""
-        return np.unique(self.joint[:, self.indices.index(i)])
-
 
 class TooManyValuesError(Exception):
     """More values than can be enumerated."""
@@ -237,11 +233,6 @@ class Given:
         parts = [rest[i * self.n_v : (i + 1) * self.n_v] for i in range(4)]
         self.probability, self.valid, self.lower, self.upper = parts
         self._sources: dict[int, set[str]] = {}
-
-    @property
-    def is_written_out(self) -> bool:
-        """Whether all was written out."""
-        return bool(self.values)
 
     def sources(self, i: int) -> set[str]:
         """The names of the inputs on which the next value of a state depends."""

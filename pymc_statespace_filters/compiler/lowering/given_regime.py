@@ -10,7 +10,7 @@ from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
 from ...system.model import StateSpaceModel
-from .finite_states import FiniteStates, start_given_values, start_symbols, step_symbols
+from .finite_states import FiniteStates, start_symbols, step_symbols
 from .symbols import SYMBOLS, call, symbols_of
 
 
@@ -100,9 +100,3 @@ def _start(
     none = {z: pt.zeros(z.type.shape)}
     mean, cov = graph_replace([state, gain @ gain.T], none, strict=False)
     return mean, cov
-
-
-def start_depends_on_regime(model: StateSpaceModel, found: FiniteStates) -> bool:
-    """Whether the continuous states at step 0 depend on the finite variables of the start."""
-    sources = (start_given_values(model).sources(i) for i in found.continuous)
-    return any(name.startswith("v.") for names in sources for name in names)

@@ -3,11 +3,11 @@
 import numpy as np
 
 from ...compiler.native.jit import njit_internal
-from ...compiler.native.plan import RECORD, REQUEST, RESULTS, plan_entry
-from ..calls import OK, opened, reals_at, single_record
+from ...compiler.native.plan import RECORD, REQUEST, plan_entry
+from ..calls import OK, opened, single_record
 from ..outcomes import NONE
-from ..plan import PLAN, read_system
-from ..point_mass.predictions import Laws, forget, observations_at, write_mixture
+from ..plan import read_system
+from ..point_mass.predictions import observations_at, unknown_laws, write_mixture
 from .forward import forward_pass, rows_on_tape
 from .machine import read_chain
 from .states import predicted_at_observations
@@ -25,14 +25,8 @@ def _predictions(plan, record, request, results):
     status, call = opened(plan, record, request, results)
     if status != OK or call.request[REQUEST.sizes_only]:
         return status
-    to, p, J = call.results, call.plan[PLAN.p], call.record[RECORD.n_rows]
-    data = single_record(call, 0, 0, J)
-    laws = Laws(
-        np.zeros(1, np.int64), reals_at(to[RESULTS.predicted], (J, p)),
-        reals_at(to[RESULTS.predicted_cov], (J, p, p)), reals_at(to[RESULTS.log_below], (J, p)),
-        reals_at(to[RESULTS.log_above], (J, p)),
-    )  # fmt: skip
-    forget(laws, 0)
+    J = call.record[RECORD.n_rows]
+    data, laws = single_record(call, 0, 0, J), unknown_laws(call)
     system = read_system(call.plan, data.theta, data.inputs)
     chain = read_chain(call.plan, data.theta, data.inputs)
     tape = np.empty((rows_on_tape(data.steps), chain.n_states))

@@ -38,16 +38,10 @@ def _grid_predictions(plan, record, request, results):
     status, call = opened(plan, record, request, results)
     if status != OK or call.request[REQUEST.sizes_only]:
         return status
-    to, p, J = call.results, call.plan[PLAN.p], call.record[RECORD.n_rows]
-    data = single_record(call, 0, 0, J)
+    J = call.record[RECORD.n_rows]
+    data, laws = single_record(call, 0, 0, J), unknown_laws(call)
     at, observed, t0, tolerance = data.steps, data.observed, data.t0, settings_of(call.plan)[0]
     system = read_system(call.plan, data.theta, data.inputs)
-    laws = Laws(
-        np.zeros(1, np.int64), reals_at(to[RESULTS.predicted], (J, p)),
-        reals_at(to[RESULTS.predicted_cov], (J, p, p)), reals_at(to[RESULTS.log_below], (J, p)),
-        reals_at(to[RESULTS.log_above], (J, p)),
-    )  # fmt: skip
-    forget(laws, 0)
     if system.failure != NONE:
         return status
     place, settings = ON_GRID, first_grid(system, at, t0, tolerance)
@@ -63,6 +57,19 @@ def _grid_predictions(plan, record, request, results):
     if code != NONE:
         forget(laws, j)
     return status
+
+
+@njit_internal
+def unknown_laws(call):
+    """The laws that a call asks for, which are still to be written."""
+    to, p, J = call.results, call.plan[PLAN.p], call.record[RECORD.n_rows]
+    laws = Laws(
+        np.zeros(1, np.int64), reals_at(to[RESULTS.predicted], (J, p)),
+        reals_at(to[RESULTS.predicted_cov], (J, p, p)), reals_at(to[RESULTS.log_below], (J, p)),
+        reals_at(to[RESULTS.log_above], (J, p)),
+    )  # fmt: skip
+    forget(laws, 0)
+    return laws
 
 
 @njit_internal
