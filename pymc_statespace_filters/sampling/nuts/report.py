@@ -3,9 +3,11 @@
 from collections.abc import Sequence
 
 import numpy as np
+from pymc.model import Model
 from pymc.stats.convergence import SamplerWarning, WarningType
 
 from ..output.convergence import MAX_RHAT
+from ..output.remedies import reaches_zero, without_transform
 from ..output.report import until_ess_warning
 from ..output.warnings import sampler_warning
 from ..run.request import SamplingRequest
@@ -20,6 +22,7 @@ _TOLERATED = 0.001
 
 
 def messages_of(
+    model: Model,
     chains: NutsChains,
     missed: Sequence[SamplerWarning],
     request: SamplingRequest,
@@ -27,10 +30,14 @@ def messages_of(
     level: str,
 ) -> list[SamplerWarning]:
     """A warning for each cause, with those of tails that were missed, and the report."""
-    problems = [*_problems(chains, names), *missed]
+    draws = chains.positions.reshape(-1, chains.positions.shape[-1])
+    bounded = reaches_zero(model, names, draws)
+    instead = None if bounded is None else without_transform(bounded)
+    problems = [*_problems(chains, names, instead), *missed]
     if request.until_ess is not None and not is_enough(request, chains.found):
         slowest = names[0] if chains.found is None else names[int(chains.found.rhat.argmax())]
-        n, ways = chains.length.n_iterations, f"use sampler='dram', or reparametrise {slowest}"
+        ways = f"or {instead}" if instead else f"use sampler='dram', or reparametrise {slowest}"
+        n = chains.length.n_iterations
         remedy = remedy_of(request, chains.length, chains.found, chains.seconds, ways)
         arguments = request.until_ess, n, chains.seconds, chains.found, names, remedy
         problems.append(until_ess_warning(*arguments))
@@ -51,13 +58,16 @@ def _report(chains: NutsChains, request: SamplingRequest, names: Sequence[str]) 
     )
 
 
-def _problems(chains: NutsChains, names: Sequence[str]) -> list[SamplerWarning]:
+def _problems(
+    chains: NutsChains, names: Sequence[str], instead: str | None
+) -> list[SamplerWarning]:
     diverging, e_bfmi = chains.statistics["diverging"], _e_bfmi(chains)
     if diverging.mean() > _TOLERATED:
         return [
             sampler_warning(
                 f"{int(diverging.sum())} of {diverging.size} draws diverged, most where "
-                f"{_neck(chains, names)}: reparametrise that variable, or use sampler='dram'."
+                f"{_neck(chains, names)}: "
+                f"{instead or "reparametrise that variable, or use sampler='dram'"}."
             )
         ]
     if e_bfmi.min() < _LEAST_E_BFMI:

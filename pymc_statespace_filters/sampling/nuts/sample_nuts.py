@@ -58,7 +58,7 @@ def sample_nuts(model: Model, request: SamplingRequest, options: ExecutionOption
         check = check_filters(tree, model, iterations, chains.seconds, rng)
     level = "info" if progressbar else "debug"
     names = element_names(model, target.raveled.variables)
-    messages = messages_of(chains, missed, request, names, level)
+    messages = messages_of(model, chains, missed, request, names, level)
     log_warnings([*messages, *check.messages(level)])
     warn_of_filters(check.warned)
     return tree

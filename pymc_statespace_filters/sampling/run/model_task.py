@@ -427,7 +427,8 @@ class ModelTask:
     ) -> list[SamplerWarning]:
         """Warn of chains that ended too early, or have not mixed."""
         request, n = self.request, self.length.n_iterations
-        until_ess, ways = request.until_ess, partial(ways_to_mix, self.model)
+        until_ess, draws = request.until_ess, np.concatenate(self._positions({}))
+        ways = partial(ways_to_mix, self.model, names, draws)
         if until_ess is not None and self.is_complete and not is_enough(request, found):
             slowest = names[0] if found is None else names[int(found.rhat.argmax())]
             remedy = remedy_of(request, self.length, found, self._seconds, ways(slowest))

@@ -1,0 +1,64 @@
+"""What chains that mix slowly are told to do."""
+
+import arviz as az
+import numpy as np
+import pymc as pm
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.sampling.output.remedies import reaches_zero, ways_to_mix
+
+RNG = np.random.default_rng(0)
+NORMAL = RNG.normal(size=4000)
+
+
+def drawn(stiffness, names=("stiffness", "other")):
+    """Unconstrained draws of a positive variable and of another one."""
+    with pm.Model() as model:
+        pm.HalfNormal("stiffness", 1)
+        pm.Normal("other", 0, 1)
+        pm.Normal("y", model["stiffness"] + model["other"], 1, observed=0.3)
+    return model, names, np.column_stack([np.log(stiffness), NORMAL])
+
+
+def test_a_posterior_that_reaches_zero():
+    for half_width in (0.01, 1.0, 100.0):
+        assert reaches_zero(*drawn(half_width * abs(NORMAL))) == "stiffness"
+    assert reaches_zero(*drawn(RNG.exponential(size=4000))) == "stiffness"
+
+
+def test_one_that_does_not():
+    assert reaches_zero(*drawn(5 + NORMAL)) is None  # none of 4000 below zero
+    assert reaches_zero(*drawn(np.exp(1.5 * NORMAL))) is None  # wide, and without density at zero
+    assert reaches_zero(*drawn(RNG.gamma(3, size=4000))) is None
+
+
+def test_the_scale_of_others_is_left_out():
+    with pm.Model() as model:
+        tau = pm.HalfNormal("tau", 1)
+        pm.Normal("theta", 0, tau)
+    positions = np.column_stack([np.log(abs(NORMAL)), NORMAL])
+    assert reaches_zero(model, ["tau", "theta"], positions) is None
+
+
+def test_the_advice():
+    model, names, positions = drawn(abs(NORMAL))
+    assert ways_to_mix(model, names, positions, "other").startswith("or sample stiffness as it is")
+    model, names, positions = drawn(5 + NORMAL)
+    assert ways_to_mix(model, names, positions, "other") == (
+        "tune longer, use psf.sample(sampler='nuts'), or reparametrise other"
+    )
+
+
+def test_the_advice_works():
+    """A sum is known, its parts are not, and one of them is positive."""
+    least = []
+    for transform in ({}, {"default_transform": None}):
+        with pm.Model() as model:
+            a, b = pm.HalfNormal("a", 1, **transform), pm.Normal("b", 0, 1)
+            pm.Normal("y", a + b, 0.001, observed=0.3)
+        idata = psf.sample_dram(
+            4000, tune=1000, model=model, random_seed=1, progressbar=False,
+            compute_convergence_checks=False,
+        )  # fmt: skip
+        least.append(az.summary(idata)["ess_tail"].min())
+    assert least[1] > 5 * least[0]
