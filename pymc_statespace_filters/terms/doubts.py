@@ -7,10 +7,11 @@ from numpy.typing import NDArray
 
 from ..errors import ModelError
 from .candidates import Candidates
-from .estimates import Weighted
+from .estimates import Visits, Weighted
 from .probabilities import Probabilities
 
 MAX_SHARE = 0.01  # of the probability, in sub-models of unreliable evidence
+MOST_APART, LEAST_APART = 4.0, 0.02  # of visits and probabilities: errors, and at least
 NEGLIGIBLE = 0.005  # probability of a single one
 
 
@@ -38,7 +39,10 @@ def unreliable(found: Probabilities, points: Sequence[Weighted]) -> NDArray[np.b
 
 
 def doubts(
-    found: Probabilities, points: Sequence[Weighted], candidates: Candidates
+    found: Probabilities,
+    points: Sequence[Weighted],
+    candidates: Candidates,
+    visits: Visits | None,
 ) -> Iterator[str]:
     """Why the errors of inclusions may be too small."""
     poor = unreliable(found, points)
@@ -52,4 +56,16 @@ def doubts(
             f"{points[worst].pareto_k:.2f}, {points[worst].n_effective:.0f} "
             "effective points): give more draws of the full model as idata, or a filter with more "
             "particles where the likelihood is noisy"
+        )
+    if visits is None:
+        return
+    error = np.hypot(visits.error, found.inclusion_se)
+    apart = np.abs(visits.frequency - found.inclusion)
+    if (far := apart > MOST_APART * error + LEAST_APART).any():
+        j = int(np.argmax(np.where(far, apart, 0.0)))
+        yield (
+            f"the chains over sub-models have visited {candidates.labels[j]} with the frequency "
+            f"{visits.frequency[j]:.2f} ± {visits.error[j]:.2f}, and the sub-models that were met "
+            f"give it the probability {found.inclusion[j]:.2f}: some that matter were not met; "
+            "run again with another random_seed, or name fewer candidates"
         )

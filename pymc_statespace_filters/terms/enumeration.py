@@ -43,7 +43,7 @@ def estimate_all(
     """Points of all sub-models (S, K), enough for the probabilities of inclusion."""
     log_prior = prior.log_weight(sets)
     announce("all sub-models", N_SCREENED * len(sets))
-    proposals = _proposals(sets, guide, uses, sampler)
+    proposals = proposals_of(sets, guide, uses, sampler)
     found = sampler.draw(proposals, [N_SCREENED] * len(sets))
     check_finite(found, candidates)
     chosen = _within_reach(found, log_prior)
@@ -60,10 +60,10 @@ def estimate_all(
     for i, one in zip(within, drawn, strict=True):
         found[i] = one
     found = _with_lighter_tails(found, sets, log_prior, sampler, rng, announce)
-    return _until_certain(found, sets, log_prior, sampler, announce)
+    return until_certain(found, sets, log_prior, sampler, announce)
 
 
-def _proposals(sets: Sets, guide: Guide, uses: Uses, sampler: Sampler) -> list[Proposal]:
+def proposals_of(sets: Sets, guide: Guide, uses: Uses, sampler: Sampler) -> list[Proposal]:
     """The proposals of sub-models, with unused variables where there are some."""
     unused = [uses.unused(one) for one in sets]
     found = [guide.proposal(one, blocks) for one, blocks in zip(sets, unused, strict=True)]
@@ -113,7 +113,7 @@ def probabilities(found: Sequence[Weighted], sets: Sets, log_prior: Array) -> Pr
     )
 
 
-def _until_certain(
+def until_certain(
     found: Sequence[Weighted], sets: Sets, log_prior: Array, sampler: Sampler, announce: Announce
 ) -> list[Weighted]:
     """Add points until the inclusions have the error that is aimed at."""

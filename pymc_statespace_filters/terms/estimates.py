@@ -23,7 +23,7 @@ from ..importance import (
     log_mean_of_independent,
     pareto_k,
 )
-from .density import Array, Point, Seeds, SubmodelDensity
+from .density import Array, Point, Seeds, Sets, SubmodelDensity
 from .proposals import Proposal
 from .unused import same
 
@@ -98,6 +98,26 @@ class Weighted:
         x = np.concatenate([self.x, *(one.x for one in others)])
         log_weights = np.concatenate([self.log_weights, *(one.log_weights for one in others)])
         return self.proposal.refitted(x, log_weights, rng)
+
+
+@dataclass(frozen=True)
+class Visits:
+    """What chains over sub-models have visited.
+
+    Attributes
+    ----------
+    sets : ndarray of bool (S, K)
+        The sub-models that were met.
+    points : list of Weighted
+        All points of each.
+    frequency, error : ndarray (K,)
+        How often each term was present, and the standard error.
+    """
+
+    sets: Sets
+    points: list[Weighted]
+    frequency: Array
+    error: Array
 
 
 class Sampler:

@@ -14,18 +14,19 @@ What is required of a set restricts either prior to the sets that are permitted.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betaln
 
 from ..errors import ModelError
-from ..importance import normalised
 from ..system.checks import is_finite
 from .candidates import Candidates
 
 BETA_BINOMIAL = "beta-binomial"
+MOST_COUNTED = 12  # candidates of which all sets are listed
+N_DRAWN = 200_000  # sets, where they are too many
 
 Array = NDArray[np.float64]
 Sets = NDArray[np.bool_]
@@ -52,7 +53,7 @@ class InclusionPrior:
         return np.asarray(~lacking.any(axis=(-1, -2)))
 
     def log_weight(self, present: Sets) -> Array:
-        """The log-probability of permitted sets (..., K), up to a constant."""
+        """The log-probability of sets (..., K) before it is restricted to permitted ones."""
         if self.probability is not None:
             with np.errstate(divide="ignore"):
                 log_p, log_not = np.log(self.probability), np.log1p(-self.probability)
@@ -66,18 +67,47 @@ class InclusionPrior:
         p = np.full(len(self.needed), 0.5) if self.probability is None else self.probability
         return np.asarray((p > 0) & (p < 1))
 
+    @property
+    def n_open(self) -> int:
+        """How many these are."""
+        return int(self.is_open.sum())
+
     def all_sets(self) -> Sets:
         """All permitted sets of positive probability, (S, K)."""
-        n = int(self.is_open.sum())
+        n = self.n_open
         present = np.zeros((2**n, len(self.needed)), dtype=bool)
         present[:, self.is_open] = (np.arange(2**n)[:, None] >> np.arange(n)) & 1
         if self.probability is not None:
             present[:, self.probability == 1] = True
-        return np.asarray(present[self.permits(present)])
+        if not (is_permitted := self.permits(present)).any():
+            raise ModelError(
+                "requires and inclusion must permit some sub-model: what must be present requires "
+                "what must be absent"
+            )
+        return np.asarray(present[is_permitted])
 
-    def probabilities(self, present: Sets) -> Array:
-        """The probabilities of all permitted sets (S, K)."""
-        return normalised(self.log_weight(present))
+    def restriction(self, rng: np.random.Generator) -> "Restriction":
+        """What the restriction to permitted sets makes of the prior.
+
+        By all sets, or by draws where these are too many.
+        """
+        if self.n_open <= MOST_COUNTED:
+            present = self.all_sets()
+            weight = np.exp(self.log_weight(present))
+            return Restriction(float(weight.sum()), weight @ present / weight.sum())
+        n, p = len(self.needed), self.probability
+        if not self.needed.any():
+            return Restriction(1.0, np.full(n, 0.5) if p is None else p)
+        drawn = rng.random((N_DRAWN, n)) < (rng.random((N_DRAWN, 1)) if p is None else p)
+        permitted = drawn[self.permits(drawn)]
+        return Restriction(len(permitted) / N_DRAWN, permitted.mean(axis=0))
+
+
+class Restriction(NamedTuple):
+    """Of a prior restricted to permitted sets."""
+
+    share: float  # of the prior, that is permitted
+    inclusion: Array  # (K,), of the terms
 
 
 def read_inclusion(candidates: Candidates, inclusion: Any, requires: Any) -> InclusionPrior:
@@ -117,9 +147,20 @@ def _needed(candidates: Candidates, requires: Any) -> Sets:
         row = candidates.number(key, "requires")
         for other in _listed(others):
             needed[row, candidates.number(other, "requires")] = True
-    if needed.diagonal().any():
-        raise ModelError(f"requires must not name a candidate for itself, got {requires!r}")
+    if _closed(needed).diagonal().any():
+        raise ModelError(
+            f"requires must not lead from a candidate back to itself, got {requires!r}: what comes "
+            "and goes together is one tuple in absent"
+        )
     return needed
+
+
+def _closed(needed: Sets) -> Sets:
+    """What candidates require, and what that requires in turn."""
+    closed = needed
+    for _ in range(len(needed)):
+        closed = closed | (closed.astype(int) @ closed.astype(int) > 0)
+    return closed
 
 
 def _listed(others: Any) -> Sequence[Any]:

@@ -109,6 +109,7 @@ class Guide:
         candidates = density.candidates.switches
         values = _values_of(idata, density.model, thin)
         self._values = candidates.held_at(self.draws.shape[1])
+        self._moments = values.mean(axis=0), values.std(axis=0)
         self._coordinates = fitted_coordinates(density, self.draws, values)
         y = self._coordinates.forward(self.draws)
         scaled = self._coordinates.of_values(values, self.draws)
@@ -126,6 +127,13 @@ class Guide:
     def base(self) -> Array:
         """A point (k,) in the middle of the draws."""
         return np.asarray(np.median(self.draws, axis=0))
+
+    @property
+    def distances(self) -> Array:
+        """How far the terms are from vanishing, in standard deviations of the draws, (K,)."""
+        of_columns = np.abs(self._moments[0] - self._values) / self._moments[1]
+        columns = self._density.candidates.switches.columns
+        return np.array([of_columns[one].max() for one in columns])
 
     def proposal(self, present: Sets, unused_blocks: NDArray[np.bool_]) -> Proposal:
         """The mixture given that the terms of a sub-model that are absent vanish."""

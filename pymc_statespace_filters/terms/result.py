@@ -8,9 +8,10 @@ import xarray as xr
 from ..evidence.comparison.prior_sensitivity import width_factors
 from ..pymc_model.inspection import filters_used
 from .candidates import Candidates
-from .density import Array, Sets, SubmodelDensity
+from .density import Sets, SubmodelDensity
 from .draws import Averaged, posterior_of
-from .estimates import Weighted
+from .estimates import Visits, Weighted
+from .inclusion import Restriction
 from .probabilities import Probabilities
 from .widths import inclusion_by_width
 
@@ -21,21 +22,22 @@ COPIED = ("observed_data", "constant_data")
 def as_datatree(
     found: Probabilities,
     points: Sequence[Weighted],
-    prior: Array,
+    prior: Restriction,
+    visits: Visits | None,
     drawn: Averaged,
     density: SubmodelDensity,
     idata: xr.DataTree,
 ) -> xr.DataTree:
     """The result; sub-models are ordered by probability.
 
-    ``prior`` (S,) has the prior probabilities of the sub-models.
+    ``visits`` are those of chains, if not all sub-models were estimated.
     """
     order = np.argsort(-found.of_models, kind="stable")
     number = np.empty(len(order), dtype=np.int64)
     number[order] = np.arange(len(order))
     like = idata["posterior"].to_dataset()
     groups = {
-        "terms": _terms(found, prior, density.candidates),
+        "terms": _terms(found, prior, visits, density.candidates),
         "models": _models(found, points, prior, density.candidates, order),
         "widths": inclusion_by_width(found, points, density, width_factors(None)),
         "posterior": posterior_of(drawn, found.present, density, like),
@@ -47,16 +49,22 @@ def as_datatree(
     return tree
 
 
-def _terms(found: Probabilities, prior: Array, candidates: Candidates) -> xr.Dataset:
+def _terms(
+    found: Probabilities, prior: Restriction, visits: Visits | None, candidates: Candidates
+) -> xr.Dataset:
     labels = candidates.labels
+    of_visits = {}
+    if visits is not None:
+        of_visits = {"visits": ("term", visits.frequency), "visits_se": ("term", visits.error)}
     return xr.Dataset(
         {
             "inclusion": ("term", found.inclusion),
             "inclusion_se": ("term", found.inclusion_se),
-            "prior_inclusion": ("term", prior @ found.present),
+            "prior_inclusion": ("term", prior.inclusion),
             "median_model": ("term", found.inclusion > 0.5),
             "pairs": (("term", "term_other"), found.pairs),
-        },
+        }
+        | of_visits,
         coords={"term": labels, "term_other": labels},
     )
 
@@ -64,7 +72,7 @@ def _terms(found: Probabilities, prior: Array, candidates: Candidates) -> xr.Dat
 def _models(
     found: Probabilities,
     points: Sequence[Weighted],
-    prior: Array,
+    prior: Restriction,
     candidates: Candidates,
     order: np.ndarray,
 ) -> xr.Dataset:
@@ -73,7 +81,7 @@ def _models(
         "probability_se": found.of_models_se,
         "log_evidence": found.log_evidence,
         "se": found.error,
-        "prior": prior,
+        "prior": np.exp(found.log_prior) / prior.share,
         "n_evaluations": np.array([one.count for one in points]),
         "n_effective": np.array([one.n_effective for one in points]),
         "pareto_k": np.array([_tail(*each) for each in zip(points, found.of_models, strict=True)]),

@@ -9,24 +9,23 @@ import pymc as pm
 import xarray as xr
 
 from ..compiler.native.compilation import COMPILATION
-from ..errors import EvidenceWarning, ModelError
+from ..errors import EvidenceWarning
 from ..progress import row_progress
 from ..pymc_model.inspection import given_model
 from ..pymc_model.posterior_draws import posterior_group
 from ..sampling import sample
 from ..system.checks import check_random_seed
 from .candidates import read_candidates
+from .chain import run_chains
 from .density import SubmodelDensity
-from .doubts import doubts
+from .doubts import check_finite, doubts
 from .draws import averaged
-from .enumeration import estimate_all, probabilities
+from .enumeration import estimate_all, probabilities, until_certain
 from .estimates import Sampler
-from .inclusion import BETA_BINOMIAL, read_inclusion
+from .inclusion import BETA_BINOMIAL, MOST_COUNTED, read_inclusion
 from .proposals import Guide
 from .result import as_datatree
 from .unused import find_uses, prior_pool
-
-MOST_CANDIDATES = 12
 
 
 def select_terms(
@@ -52,7 +51,7 @@ def select_terms(
     absent : mapping
         The candidates, and the values at which their terms vanish: a scalar variable ``"k3"``, an
         element ``"b[3]"``, or a tuple of such names, with a tuple of values, for what comes and
-        goes together. At most 12.
+        goes together.
     idata : xarray.DataTree, optional
         Posterior draws of the full model, from any sampler. They say where to look, and not what
         the result is. Default: those of `sample`.
@@ -76,7 +75,7 @@ def select_terms(
         above one half; ``pairs`` along ``term`` and ``term_other``, the probability that both are
         present.
 
-        ``models`` : all sub-models along ``model``, most probable first, with what is ``present``
+        ``models`` : the sub-models along ``model``, most probable first, with what is ``present``
         along ``term``; ``probability`` with its error ``probability_se``, ``log_evidence`` with its
         error ``se``, ``prior``, and of the points behind it the number ``n_evaluations``, the
         effective number ``n_effective`` and the tail of their weights, ``pareto_k``.
@@ -95,14 +94,15 @@ def select_terms(
     ModelError
         If an argument is invalid: a candidate that is no free variable or has no density of its
         own, a value at which the likelihood is not finite, two candidates that switch off the same
-        term, too many candidates.
+        term.
     DataMismatchError
         If the draws belong to another model.
 
     Warns
     -----
     EvidenceWarning
-        If sub-models that matter have few effective points.
+        If sub-models that matter have few effective points, or if chains visit a term more or less
+        often than the sub-models that were met say.
 
     Notes
     -----
@@ -111,11 +111,20 @@ def select_terms(
     own points. With an unbiased filter every point has fresh noise, so that the mean is exact, and
     the standard errors contain the noise.
 
+    Of up to 12 candidates all sub-models are estimated. Of more, four chains of 1000 steps walk
+    over the sub-models, adding, dropping and swapping terms. With estimates that are unbiased and
+    made anew for each proposal their law is exactly the posterior (Andrieu and Roberts 2009):
+    ``visits`` in ``terms``, with ``visits_se``, are the frequencies. ``inclusion`` has the smaller
+    errors, but is relative to the sub-models that were met, which are those in ``models``.
+
     Variables that only absent terms use have their prior: the scale of the slabs, the gap of a
     spring that is not there.
 
     References
     ----------
+    C. Andrieu and G. O. Roberts (2009). The pseudo-marginal approach for efficient Monte Carlo
+    computations. Annals of Statistics 37, 697-725.
+
     J. G. Scott and J. O. Berger (2010). Bayes and empirical-Bayes multiplicity adjustment in the
     variable-selection problem. Annals of Statistics 38, 2587-2619.
 
@@ -141,11 +150,6 @@ def select_terms(
     model = given_model(model)
     candidates = read_candidates(model, absent)
     prior = read_inclusion(candidates, inclusion, requires)
-    if (n_open := int(prior.is_open.sum())) > MOST_CANDIDATES:
-        raise ModelError(
-            f"absent must have at most {MOST_CANDIDATES} candidates, got {n_open}: tuples of terms "
-            "that come and go together count once, and those of inclusion 0 or 1 not at all"
-        )
     rng = check_random_seed(random_seed)
     if idata is None:
         idata = sample(model=model, random_seed=rng, progressbar=progressbar)
@@ -157,12 +161,21 @@ def select_terms(
         with row_progress(density.density.calls, enabled=progressbar) as announce:
             uses = find_uses(density, guide.draws, rng)
             sampler = Sampler(density, guide.base, prior_pool(density, uses, rng), rng)
-            sets = prior.all_sets()
-            points = estimate_all(sets, candidates, prior, guide, uses, sampler, rng, announce)
+            visits = None
+            if prior.n_open <= MOST_COUNTED:
+                sets = prior.all_sets()
+                points = estimate_all(sets, candidates, prior, guide, uses, sampler, rng, announce)
+            else:
+                visits = run_chains(prior, guide, uses, sampler, rng, announce)
+                check_finite(visits.points, candidates)
+                sets = visits.sets
+                points = until_certain(
+                    visits.points, sets, prior.log_weight(sets), sampler, announce
+                )
         found = probabilities(points, sets, prior.log_weight(sets))
         count = like.sizes["chain"] * like.sizes["draw"]
         drawn = averaged(points, found.of_models, count, rng)
-        tree = as_datatree(found, points, prior.probabilities(sets), drawn, density, idata)
-    for doubt in doubts(found, points, candidates):
+        tree = as_datatree(found, points, prior.restriction(rng), visits, drawn, density, idata)
+    for doubt in doubts(found, points, candidates, visits):
         warnings.warn(f"probabilities of terms: {doubt}", EvidenceWarning, stacklevel=2)
     return tree

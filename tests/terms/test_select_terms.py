@@ -1,5 +1,6 @@
 """Sub-models of a regression, whose evidences are known, and what a term leaves unused."""
 
+import sys
 from functools import cache
 
 import numpy as np
@@ -10,6 +11,7 @@ from scipy.special import betaln, logsumexp
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.terms import chain
 from tests.terms.regression import Regression
 
 
@@ -205,7 +207,12 @@ def test_states_of_averaged_draws():
         ({"b0": 0.0}, {"inclusion": {"b0": 1.5}}, "from 0 to 1 for 'b0', got 1.5"),
         ({"b0": 0.0}, {"inclusion": {"b1": 0.5}}, "inclusion must name candidates"),
         ({"b0": 0.0, "b1": 0.0}, {"inclusion": {"b1": 0.5}}, "for every candidate"),
-        ({"b0": 0.0}, {"requires": {"b0": "b0"}}, "for itself"),
+        ({"b0": 0.0}, {"requires": {"b0": "b0"}}, "back to itself"),
+        (
+            {"b0": 0.0, "b1": 0.0},
+            {"requires": {"b0": "b1", "b1": "b0"}},
+            "back to itself.*one tuple",
+        ),
         ({"b0": 0.0}, {"requires": {"b0": "b1"}}, "requires must name candidates"),
         ({"b0": 0.0}, {"requires": "b0"}, "requires must be a dictionary"),
     ],
@@ -302,3 +309,17 @@ def test_noisy_likelihoods_have_the_evidences_of_exact_ones():
 def draws_of_values(values):
     posterior = {name: (("chain", "draw"), one) for name, one in values.items()}
     return xr.DataTree.from_dict({"posterior": xr.Dataset(posterior)})
+
+
+def test_chains_over_sub_models_agree_with_all_of_them(monkeypatch):
+    function = sys.modules["pymc_statespace_filters.terms.select_terms"]
+    monkeypatch.setattr(function, "MOST_COUNTED", 3)
+    monkeypatch.setattr(chain, "N_STEPS", 400)
+    regression = few_terms()
+    terms = selected(regression, requires={"b2": "b1"})["terms"]
+    size, has = regression.sets.sum(axis=1), regression.sets
+    logs = regression.log_evidence + betaln(size + 1, 5 - size)
+    logs = np.where(has[:, 2] & ~has[:, 1], -np.inf, logs)
+    truth = np.exp(logs - logsumexp(logs)) @ has
+    assert (np.abs(terms["visits"] - truth) < 4 * terms["visits_se"]).all()
+    assert (np.abs(terms["inclusion"] - truth) < 4 * terms["inclusion_se"] + 1e-3).all()

@@ -1,0 +1,98 @@
+"""Whether the probabilities of terms that `select_terms` reports are calibrated.
+
+Of a linear system with five inputs, the numbers of terms, the terms and their coefficients are
+drawn from the prior. Of all terms with a reported probability p a share p must be there: the
+logistic regression of presence on the reported log odds has intercept 0 and slope 1.
+
+``python -m benchmarks.terms 300`` prints, of 300 records, these two with their errors, z of
+sum(presence - probability), and the mean CPU seconds of a record; a second number is the first
+seed, and ``particles`` a third argument that takes `BootstrapPF(200)` instead of the exact `EKF`.
+"""
+
+import logging
+import sys
+import time
+import warnings
+
+import numpy as np
+import pymc as pm
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.errors import EvidenceWarning, FilterWarning
+
+N_ROWS, N_TERMS = 40, 5
+STEPS = np.arange(1, N_ROWS + 1)
+INPUTS = np.random.default_rng(0).normal(size=(N_ROWS, N_TERMS))
+INPUTS[:, 1] = 0.8 * INPUTS[:, 0] + 0.6 * INPUTS[:, 1]
+SLAB = 0.4
+NAMES = [f"b[{i}]" for i in range(N_TERMS)]
+SYSTEM = psf.StateSpaceModel(
+    transition=lambda x, q, u, b: [0.7 * x[0] + (b * u).sum() + q[0]],
+    process_noise=lambda sigma: [[sigma**2]],
+    observation=lambda x: [x[0]],
+    observation_noise=[[0.2]],
+    initial_mean=[0.0],
+    initial_cov=[[0.1]],
+    inputs=[f"u{i}" for i in range(N_TERMS)],
+    shapes={"b": (N_TERMS,)},
+)
+
+
+def one_record(seed, filter):
+    """Which terms are there, their reported probabilities, and the CPU seconds."""
+    rng = np.random.default_rng(seed)
+    present = np.zeros(N_TERMS, dtype=bool)
+    present[rng.permutation(N_TERMS)[: rng.integers(N_TERMS + 1)]] = True
+    truth = {
+        "b": SLAB * rng.standard_normal(N_TERMS) * present,
+        "sigma": abs(0.5 * rng.standard_normal()),
+    }
+    record = psf.simulate(SYSTEM, truth, steps=STEPS, inputs=INPUTS, random_seed=rng)
+    begin = time.process_time()
+    with pm.Model() as model:
+        pm.Normal("b", 0, SLAB, shape=N_TERMS)
+        pm.HalfNormal("sigma", 0.5)
+        psf.StateSpace(
+            "y", SYSTEM, filter, steps=STEPS, inputs=INPUTS, observed=record["observations"]
+        )
+    idata = psf.sample_dram(500, tune=500, model=model, random_seed=rng, progressbar=False)
+    found = psf.select_terms(
+        model, dict.fromkeys(NAMES, 0.0), idata=idata, random_seed=rng, progressbar=False
+    )
+    return present, found["terms"]["inclusion"].values, time.process_time() - begin
+
+
+def logistic_regression(log_odds, presence, groups):
+    """Intercept and slope with errors that allow for terms of one record that depend."""
+    design, beta = np.column_stack([np.ones_like(log_odds), log_odds]), np.array([0.0, 1.0])
+    for _ in range(50):
+        p = 1 / (1 + np.exp(-design @ beta))
+        hessian = design.T @ (design * (p * (1 - p))[:, None])
+        beta = beta + np.linalg.solve(hessian, design.T @ (presence - p))
+    scores = design * (presence - 1 / (1 + np.exp(-design @ beta)))[:, None]
+    by_record = np.array([scores[groups == one].sum(axis=0) for one in np.unique(groups)])
+    inverse = np.linalg.inv(hessian)
+    return beta, np.sqrt(np.diag(inverse @ (by_record.T @ by_record) @ inverse))
+
+
+def main(count, first=1, kind="exact"):
+    """Print what the terms of so many records say."""
+    filter = psf.EKF() if kind == "exact" else psf.BootstrapPF(200)
+    logging.getLogger("pymc").setLevel(logging.ERROR)
+    warnings.simplefilter("ignore", EvidenceWarning)
+    warnings.simplefilter("ignore", FilterWarning)
+    found = [one_record(seed, filter) for seed in range(first, first + count)]
+    presence = np.concatenate([one for one, _, _ in found]).astype(float)
+    p = np.clip(np.concatenate([one for _, one, _ in found]), 1e-9, 1 - 1e-9)
+    beta, error = logistic_regression(
+        np.log(p / (1 - p)), presence, np.repeat(np.arange(count), N_TERMS)
+    )
+    differences = (presence - p).reshape(count, N_TERMS).sum(axis=1)
+    print(f"{count} records from seed {first}, {kind}")
+    print(f"intercept {beta[0]:.2f} ({error[0]:.2f}), slope {beta[1]:.2f} ({error[1]:.2f})")
+    print(f"z of the sum {differences.sum() / np.sqrt((differences**2).sum()):.1f}")
+    print(f"{np.mean([seconds for _, _, seconds in found]):.1f} CPU s a record")
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:3]), *sys.argv[3:4])

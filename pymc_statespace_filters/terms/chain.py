@@ -1,0 +1,143 @@
+r"""A chain over sub-models, where they are too many to be estimated one by one.
+
+A step adds or drops a term, or swaps one for another; both kinds of moves are symmetric. The
+evidence of a proposed sub-model is estimated anew, by the mean of raw weights, and that of the
+current one is kept: with unbiased estimates the chain has exactly the posterior over sub-models as
+its law (Andrieu and Roberts 2009), however large the errors are, which only decide how well it
+moves. The number of points of an estimate is that of a relative variance of a half or less.
+
+The proposal density of a sub-model is fitted when it is first met, from points of its own, and
+stays. All weights together then give the evidences of all sub-models that were met, and
+probabilities renormalised over these, which have smaller errors than frequencies of visits but know
+nothing of what was not met.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..importance import mcse_of_chains
+from .density import Array, Sets
+from .enumeration import N_SCREENED, REACH, Announce, improved, proposals_of
+from .estimates import Sampler, Visits, Weighted
+from .inclusion import InclusionPrior
+from .proposals import Guide
+from .unused import Uses
+
+N_CHAINS, N_STEPS, N_DROPPED = 4, 1000, 100  # the first steps are dropped
+STARTS = (1.0, 2.0, 3.0)  # standard deviations from where a term vanishes, to be present at first
+FEWEST, MOST = 32, 400  # points of an estimate
+VARIANCE = 0.5  # relative, of an estimate
+
+
+class _Met:
+    """Sub-models that were met: their proposal densities, and all points drawn since."""
+
+    def __init__(
+        self,
+        prior: InclusionPrior,
+        guide: Guide,
+        uses: Uses,
+        sampler: Sampler,
+        rng: np.random.Generator,
+    ) -> None:
+        self._prior, self._guide, self._uses = prior, guide, uses
+        self._sampler, self._rng = sampler, rng
+        self._highest = -np.inf
+        self._pilots: dict[bytes, Weighted] = {}
+        self.points: dict[bytes, Weighted] = {}
+
+    def heights(self, sets: Sets) -> Array:
+        """New estimates of the log-posterior of sub-models (m, K), each from points of its own."""
+        by_key = {one.tobytes(): one for one in sets}
+        self._fit({key: one for key, one in by_key.items() if key not in self._pilots})
+        keys = [one.tobytes() for one in sets]
+        pilots = [self._pilots[key] for key in keys]
+        drawn = self._sampler.draw([one.proposal for one in pilots], [_count(p) for p in pilots])
+        for key, one in zip(keys, drawn, strict=True):
+            known = self.points.get(key)
+            self.points[key] = one if known is None else known.joined(one)
+        return self._heights(drawn, sets)
+
+    def _fit(self, new: dict[bytes, Sets]) -> None:
+        """Fit the proposal densities of sub-models, again and again if they are within reach."""
+        if not new:
+            return
+        sets = np.array(list(new.values()))
+        first = proposals_of(sets, self._guide, self._uses, self._sampler)
+        found = self._sampler.draw(first, [N_SCREENED] * len(first))
+        height = self._heights(found, sets)
+        self._highest = max(self._highest, height.max())
+        within = np.flatnonzero(height > self._highest - REACH).tolist()
+        chosen = [first[i] for i in within]
+        better = improved(chosen, self._sampler, self._rng, lambda task, total: None)
+        for i, one in zip(within, better, strict=True):
+            found[i] = one
+        self._pilots |= dict(zip(new, found, strict=True))
+
+    def _heights(self, found: Sequence[Weighted], sets: Sets) -> Array:
+        return np.asarray(self._prior.log_weight(sets) + [one.mean.value for one in found])
+
+
+def _count(pilot: Weighted) -> int:
+    """How many points give an estimate the variance that is aimed at."""
+    efficiency = max(pilot.efficiency, 1e-6)
+    return int(np.clip((1 / efficiency - 1) / VARIANCE, FEWEST, MOST))
+
+
+def run_chains(
+    prior: InclusionPrior,
+    guide: Guide,
+    uses: Uses,
+    sampler: Sampler,
+    rng: np.random.Generator,
+    announce: Announce,
+) -> Visits:
+    """Let several chains walk over the sub-models, in step with each other."""
+    met = _Met(prior, guide, uses, sampler, rng)
+    at = _starts(prior, guide)
+    height = met.heights(at)
+    visited = np.empty((N_CHAINS, N_STEPS, at.shape[1]), dtype=bool)
+    announce("chains over sub-models", N_CHAINS * N_STEPS * FEWEST)
+    for step in range(N_STEPS):
+        proposed = np.array([_moved(one, prior.is_open, rng) for one in at])
+        tried = np.flatnonzero((proposed != at).any(axis=1) & prior.permits(proposed))
+        new = met.heights(proposed[tried]) if tried.size else np.empty(0)
+        accepted = np.log(rng.random(len(tried))) < new - height[tried]
+        at[tried[accepted]] = proposed[tried[accepted]]
+        height[tried[accepted]] = new[accepted]
+        visited[:, step] = at
+    kept = visited[:, N_DROPPED:].astype(float)
+    error = [mcse_of_chains(one) if np.ptp(one) else 0.0 for one in np.moveaxis(kept, -1, 0)]
+    sets = np.array([one.proposal.present for one in met.points.values()])
+    return Visits(sets, list(met.points.values()), kept.mean(axis=(0, 1)), np.array(error))
+
+
+def _moved(present: Sets, is_open: Sets, rng: np.random.Generator) -> Sets:
+    """A set with one term added or dropped, or one swapped for another."""
+    moved = present.copy()
+    inside, outside = np.flatnonzero(present & is_open), np.flatnonzero(~present & is_open)
+    if rng.random() < 0.5:
+        moved[rng.choice(np.flatnonzero(is_open))] ^= True
+    elif inside.size and outside.size:
+        moved[rng.choice(inside)] = False
+        moved[rng.choice(outside)] = True
+    return moved
+
+
+def _starts(prior: InclusionPrior, guide: Guide) -> Sets:
+    """The full model, and those of the terms that the draws say are far from vanishing."""
+    distance = guide.distances
+    starts = [np.ones(len(distance), dtype=bool), *(distance > limit for limit in STARTS)]
+    is_certain = ~prior.is_open
+    if prior.probability is not None:
+        certain = prior.probability == 1
+        starts = [np.where(is_certain, certain, one) for one in starts]
+    return np.array([_with_needed(one, prior) for one in starts])
+
+
+def _with_needed(present: Sets, prior: InclusionPrior) -> Sets:
+    """A set with all that its members require."""
+    while not prior.permits(present):
+        present = present | prior.needed[present].any(axis=0)
+    return present
