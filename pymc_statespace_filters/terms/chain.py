@@ -6,6 +6,9 @@ current one is kept: with unbiased estimates the chain has exactly the posterior
 its law (Andrieu and Roberts 2009), however large the errors are, which only decide how well it
 moves. The number of points of an estimate is that of a relative variance of a half or less.
 
+A start may be far from all that is probable: a chain that is out of reach of the best sub-model met
+when the first steps are over begins again there.
+
 The proposal density of a sub-model is fitted when it is first met, from points of its own, and
 stays. All weights together then give the evidences of all sub-models that were met, and
 probabilities renormalised over these, which have smaller errors than frequencies of visits but know
@@ -15,6 +18,7 @@ nothing of what was not met.
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..importance import mcse_of_chains
 from .density import Array, Sets
@@ -24,7 +28,7 @@ from .inclusion import InclusionPrior
 from .proposals import Guide
 from .unused import Uses
 
-N_CHAINS, N_STEPS, N_DROPPED = 4, 1000, 100  # the first steps are dropped
+N_CHAINS, N_STEPS, N_DROPPED = 4, 1000, 200  # the first steps are dropped
 STARTS = (1.0, 2.0, 3.0)  # standard deviations from where a term vanishes, to be present at first
 FEWEST, MOST = 32, 400  # points of an estimate
 VARIANCE = 0.5  # relative, of an estimate
@@ -58,6 +62,21 @@ class _Met:
             known = self.points.get(key)
             self.points[key] = one if known is None else known.joined(one)
         return self._heights(drawn, sets)
+
+    def lost(self, sets: Sets) -> NDArray[np.bool_]:
+        """Whether sub-models (m, K) are out of reach of the best, by all points of each."""
+        points = [self.points[one.tobytes()] for one in sets]
+        return self._heights(points, sets) < self._heights_of_all().max() - REACH
+
+    @property
+    def best(self) -> Sets:
+        """The most probable sub-model that was met, (K,)."""
+        number = int(np.argmax(self._heights_of_all()))
+        return list(self.points.values())[number].proposal.present
+
+    def _heights_of_all(self) -> Array:
+        points = list(self.points.values())
+        return self._heights(points, np.array([one.proposal.present for one in points]))
 
     def _fit(self, new: dict[bytes, Sets]) -> None:
         """Fit the proposal densities of sub-models, again and again if they are within reach."""
@@ -107,6 +126,10 @@ def run_chains(
         at[tried[accepted]] = proposed[tried[accepted]]
         height[tried[accepted]] = new[accepted]
         visited[:, step] = at
+        if step == N_DROPPED - 1:
+            lost = np.flatnonzero(met.lost(at))
+            at[lost] = met.best
+            height[lost] = met.heights(at[lost]) if lost.size else height[lost]
     kept = visited[:, N_DROPPED:].astype(float)
     error = [mcse_of_chains(one) if np.ptp(one) else 0.0 for one in np.moveaxis(kept, -1, 0)]
     sets = np.array([one.proposal.present for one in met.points.values()])
