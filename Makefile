@@ -37,8 +37,9 @@ environment: $(VENV)/.installed  ## create .venv; all other commands do this the
 demo: $(VENV)/.installed  ## compare three models of a double well, in out/; CSV=my_record.csv for your own record
 	$(IN)/python examples/double_well.py $(if $(CSV),--csv "$(CSV)")
 
-demo-quick: $(VENV)/.installed  ## the same with short chains, to check that it runs
+demo-quick: $(VENV)/.installed  ## the same with short chains, and the example of terms, to check that they run
 	$(IN)/python examples/double_well.py --quick --out out/quick $(if $(CSV),--csv "$(CSV)")
+	$(IN)/python examples/terms.py --quick --out out/quick
 
 thesis: $(VENV)/.installed  ## run the studies of the thesis at its settings, in out/thesis; takes hours, resumes; STUDIES=double_well
 	for study in $(STUDIES); do $(IN)/python examples/thesis/$$study.py $(ARGS) || exit 1; done

@@ -1,7 +1,7 @@
 """The public function: automatic relevance determination from draws of the full model."""
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 import pandas as pd
@@ -18,12 +18,12 @@ from ...progress import row_progress
 from ...pymc_model.inspection import given_model
 from ...pymc_model.posterior_draws import posterior_group, unconstrained_draws
 from ...system.checks import check_random_seed
-from .ard_evidence import ABSENT, ArdEvidence
+from .ard_evidence import ABSENT
 from .chosen_terms import ChosenTerms, chosen_terms
 from .optimum import largest_evidence, largest_without
-from .table import RelevanceTable, sentences
+from .table import Optimised, relevance_table
 from .term_mixture import TermMixture, fit_terms
-from .weighed import N_POINTS, TermDensity, Weighed
+from .weighed import N_POINTS, TermDensity
 
 MOST_FITTED = 4000  # draws
 
@@ -64,7 +64,7 @@ def relevance(
     Returns
     -------
     pandas.DataFrame
-        A row for each coefficient, index ``term``. Its display shows the first six columns:
+        A row for each coefficient, index ``term``. Its display shows the first seven columns:
 
         ``relevance``
             :math:`1 - \alpha_j \operatorname{Var}(\phi_j)`, between 0, irrelevant, and 1: how much
@@ -77,6 +77,8 @@ def relevance(
         ``gain``, ``gain_se``
             Log-evidence minus that without the term, the other priors optimised anew, and its
             standard error; zero for irrelevant terms, NaN if the points do not determine it.
+        ``rivals``
+            Irrelevant terms that become relevant where this one is left out.
         ``alpha``
             The precision of the prior.
         ``pareto_k``, ``n_effective``
@@ -85,7 +87,8 @@ def relevance(
             Why the gain is unknown; empty if it is known.
 
         Its attributes ``log_evidence`` and ``log_evidence_se`` are those under all priors together.
-        ``inclusion`` is an argument for `select_terms`, with zero for the irrelevant terms.
+        ``inclusion`` is an argument for `select_terms`, with zero for the terms that are irrelevant
+        and rivals of none.
 
     Raises
     ------
@@ -112,7 +115,8 @@ def relevance(
     relevance is the mean over the components of the mixture, and the evidence is computed again
     from the true density, by importance sampling.
 
-    The optimum is a point: a term without any effect has a finite prior in about a third of all
+    The optimum is a point. Of terms that can stand for each other it has one, perhaps not the true
+    one: look at the rivals. A term without any effect has a finite prior in about a third of all
     data sets, with a small gain. A gain is not a Bayes factor for the term, as the prior was fitted
     to the same data; for one term whose estimate is t standard deviations from zero it is
     :math:`(t^2 - 1) / 2 - \log |t|` nats. `select_terms` averages over sub-models instead.
@@ -150,99 +154,53 @@ def relevance(
         density = TermDensity(terms)
         draws = unconstrained_draws(idata, terms.model)
     with row_progress(density.calls, enabled=progressbar) as announce:
-        kept = draws[:, :: -(-draws.shape[0] * draws.shape[1] // MOST_FITTED)]
-        announce("density of the draws", kept.shape[0] * kept.shape[1])
-        log_density, log_prior = density.at_draws(kept.reshape(-1, kept.shape[-1]), rng)
-        check_overlap(log_density)
-        chains = Posterior(kept, log_density.reshape(kept.shape[:2]), lambda x, rng: log_density)
-        doubts = [*check_convergence(chains, idata)]
-        # Only normal priors are divided out in closed form.
-        log_weights = -log_prior[:, terms.prior_precision == 0].sum(axis=1)
-        doubts += _few(log_weights)
-        mixture = fit_terms(kept.reshape(-1, kept.shape[-1]), log_weights, terms.columns, rng)
+        announce("density of the draws", min(MOST_FITTED, draws.shape[0] * draws.shape[1]))
+        mixture, doubts = _fitted(terms, density, draws, idata, rng)
         evidence = mixture.ard_evidence(terms)
+
+        def at(log_alpha: Array) -> Optimised:
+            proposals = mixture.proposals(evidence, log_alpha)
+            sd = np.where(log_alpha < ABSENT, mixture.units * np.exp(-0.5 * log_alpha), 0.0)
+            of_data = evidence.relevance(log_alpha)
+            return Optimised(sd, of_data * (sd > 0), density.weigh(proposals, sd, rng))
+
         optimum = largest_evidence(evidence, rng)
         present = np.flatnonzero(optimum < ABSENT).tolist()
         announce("true density", N_POINTS * (1 + len(present)))
-        found = _weigh(density, mixture, evidence, optimum, rng)
-        without = {
-            j: _weigh(density, mixture, evidence, largest_without(evidence, optimum, j), rng)
-            for j in present
-        }
-    table = _table(terms, mixture, evidence, optimum, found, without)
-    doubts += [f"the optimum: {one}" for one in found.doubts()]
+        best = at(optimum)
+        without = {j: at(largest_without(evidence, optimum, j)) for j in present}
+    table = relevance_table(terms.names, best, without)
+    doubts += [f"the optimum: {one}" for one in best.weighed.doubts()]
     doubts += [f"without {name}: {one}" for name, one in table["doubts"].items() if one]
     if doubts:
         warnings.warn(f"relevance: {'; '.join(doubts)}", EvidenceWarning, stacklevel=2)
-    log_evidence, se = found.evidence
-    said = sentences(table, log_evidence, se)
-    return RelevanceTable(table, log_evidence=log_evidence, log_evidence_se=se, sentences=[*said])
+    return table
 
 
-def _few(log_weights: Array) -> list[str]:
+def _fitted(
+    terms: ChosenTerms,
+    density: TermDensity,
+    draws: Array,
+    idata: xr.DataTree,
+    rng: np.random.Generator,
+) -> tuple[TermMixture, list[str]]:
+    """The mixture fitted to draws (chain, draw, k), and doubts about these."""
+    kept = draws[:, :: -(-draws.shape[0] * draws.shape[1] // MOST_FITTED)]
+    x = kept.reshape(-1, kept.shape[-1])
+    log_density, log_prior = density.at_draws(x, rng)
+    check_overlap(log_density)
+    chains = Posterior(kept, log_density.reshape(kept.shape[:2]), lambda x, rng: log_density)
+    # Only normal priors are divided out in closed form.
+    log_weights = -log_prior[:, terms.prior_precision == 0].sum(axis=1)
+    doubts = [*check_convergence(chains, idata), *_few(log_weights)]
+    return fit_terms(x, log_weights, terms.columns, rng), doubts
+
+
+def _few(log_weights: Array) -> Iterator[str]:
     """A doubt if few draws are left under flat priors."""
     n_effective = 1 / (normalised(log_weights) ** 2).sum()
-    if n_effective >= MIN_EFFECTIVE:
-        return []
-    return [
-        f"the draws are worth {n_effective:.0f} draws under flat priors of the coefficients: give "
-        "these normal priors"
-    ]
-
-
-def _weigh(
-    density: TermDensity,
-    mixture: TermMixture,
-    evidence: ArdEvidence,
-    log_alpha: Array,
-    rng: np.random.Generator,
-) -> Weighed:
-    """The true density under priors with these log-precisions."""
-    prior_sd = np.where(log_alpha < ABSENT, mixture.units * np.exp(-0.5 * log_alpha), 0.0)
-    return density.weigh(mixture.proposals(evidence, log_alpha), prior_sd, rng)
-
-
-def _table(
-    terms: ChosenTerms,
-    mixture: TermMixture,
-    evidence: ArdEvidence,
-    optimum: Array,
-    found: Weighed,
-    without: dict[int, Weighed],
-) -> pd.DataFrame:
-    rows = []
-    relevances = evidence.relevance(optimum)
-    for j, name in enumerate(terms.names):
-        prior_sd = mixture.units[j] * np.exp(-0.5 * optimum[j]) if j in without else 0.0
-        row = {
-            "term": name,
-            "relevance": relevances[j] if j in without else 0.0,
-            "prior_sd": prior_sd,
-            "mean": found.mean[j],
-            "sd": found.sd[j],
-        }
-        rows.append(
-            row | _gain(found, without.get(j)) | {"alpha": prior_sd**-2 if prior_sd else np.inf}
+    if n_effective < MIN_EFFECTIVE:
+        yield (
+            f"the draws are worth {n_effective:.0f} draws under flat priors of the coefficients: "
+            "give these normal priors"
         )
-    return pd.DataFrame(rows).set_index("term")
-
-
-def _gain(found: Weighed, without: Weighed | None) -> dict[str, object]:
-    """The columns that compare the optimum with that without a term, None if it is the same."""
-    if without is None:
-        return {
-            "gain": 0.0,
-            "gain_se": 0.0,
-            "pareto_k": -np.inf,
-            "n_effective": np.inf,
-            "doubts": "",
-        }
-    doubts = "; ".join(without.doubts())
-    se = float(np.hypot(found.evidence.error, without.evidence.error))
-    return {
-        "gain": np.nan if doubts else found.evidence.value - without.evidence.value,
-        "gain_se": np.nan if doubts else se,
-        "pareto_k": without.tail,
-        "n_effective": without.evidence.kish_ess(N_POINTS),
-        "doubts": doubts,
-    }

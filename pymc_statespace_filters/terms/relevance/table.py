@@ -1,12 +1,29 @@
 """The table of `relevance`."""
 
-from collections.abc import Iterator
-from typing import Any, ClassVar, Self
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from ...tables import SentenceTable
+from .weighed import N_POINTS, Weighed
+
+SURE = 6.0  # nats of gain, from which a term is not in question
+
+Array = NDArray[np.float64]
+
+
+class Optimised(NamedTuple):
+    """Priors of the largest evidence, and the true density under them.
+
+    ``prior_sd`` and ``relevance`` (p,) are zero where a term is absent.
+    """
+
+    prior_sd: Array
+    relevance: Array
+    weighed: Weighed
 
 
 class RelevanceTable(SentenceTable):
@@ -26,6 +43,7 @@ class RelevanceTable(SentenceTable):
         "sd",
         "gain",
         "gain_se",
+        "rivals",
     )
 
     def __init__(
@@ -36,8 +54,14 @@ class RelevanceTable(SentenceTable):
 
     @property
     def inclusion(self) -> dict[str, float]:
-        """For `select_terms`: zero, always absent, for irrelevant terms, and 1/2 for the others."""
-        return {str(name): 0.5 if one > 0 else 0.0 for name, one in self["prior_sd"].items()}
+        """For `select_terms`: zero, always absent, for irrelevant terms.
+
+        Rivals of a term with a gain below `SURE` stay open, as other terms do: 1/2.
+        """
+        in_doubt = self.loc[~(self["gain"] >= SURE), "rivals"]
+        rivals = {one for names in in_doubt for one in names.split("; ")}
+        is_open = (self["prior_sd"] > 0) | self.index.isin(rivals)
+        return {str(name): 0.5 if one else 0.0 for name, one in is_open.items()}
 
     def __copy__(self, deep: bool = False) -> Self:
         return type(self)(
@@ -53,10 +77,50 @@ class RelevanceTable(SentenceTable):
             return [
                 "unknown" if np.isnan(one) else f"{one:.{decimals[name]}f}" for one in self[name]
             ]
-        return [f"{one:.3g}" for one in self[name]]
+        return [one if isinstance(one, str) else f"{one:.3g}" for one in self[name]]
 
 
-def sentences(table: pd.DataFrame, evidence: float, error: float) -> Iterator[str]:
+def relevance_table(
+    names: Sequence[str], best: Optimised, without: Mapping[int, Optimised]
+) -> RelevanceTable:
+    """The table of the optimum, and of those without one of its terms."""
+    table = pd.DataFrame(
+        {
+            "relevance": best.relevance,
+            "prior_sd": best.prior_sd,
+            "mean": best.weighed.mean,
+            "sd": best.weighed.sd,
+        },
+        index=pd.Index(names, name="term"),
+    )
+    gains = [_gain(best, without.get(j), names) for j in range(len(names))]
+    table = table.join(pd.DataFrame(gains, index=table.index))
+    with np.errstate(divide="ignore"):
+        table["alpha"] = table["prior_sd"] ** -2.0
+    log_evidence, se = best.weighed.evidence
+    said = [*_sentences(table, log_evidence, se)]
+    return RelevanceTable(table, log_evidence=log_evidence, log_evidence_se=se, sentences=said)
+
+
+def _gain(best: Optimised, without: Optimised | None, names: Sequence[str]) -> dict[str, Any]:
+    """The columns that compare the optimum with that without a term, None if it is the same."""
+    if without is None:
+        known = {"gain": 0.0, "gain_se": 0.0, "rivals": "", "pareto_k": -np.inf}
+        return known | {"n_effective": np.inf, "doubts": ""}
+    one, other = best.weighed.evidence, without.weighed.evidence
+    doubts = "; ".join(without.weighed.doubts())
+    rivals = (best.prior_sd == 0) & (without.prior_sd > 0)
+    return {
+        "gain": np.nan if doubts else one.value - other.value,
+        "gain_se": np.nan if doubts else float(np.hypot(one.error, other.error)),
+        "rivals": "; ".join(np.array(names)[rivals]),
+        "pareto_k": without.weighed.tail,
+        "n_effective": other.kish_ess(N_POINTS),
+        "doubts": doubts,
+    }
+
+
+def _sentences(table: pd.DataFrame, evidence: float, error: float) -> Iterator[str]:
     """What the display says below the columns."""
     yield f"Log-evidence under these priors: {evidence:.2f} ± {error:.2f}."
     if out := [str(name) for name in table.index[table["prior_sd"] == 0]]:

@@ -153,3 +153,23 @@ def test_other_coefficients_are_refused(names, message):
         pm.Normal("y", half + shrunk + joint.sum(), observed=[0.3])
     with pytest.raises(ModelError, match=message):
         psf.relevance(draws(regression()), model, names)
+
+
+def test_a_rival_of_a_term_in_doubt_stays_open():
+    """Two coefficients of nearly the same design: the optimum has one, and names the other."""
+    rng = np.random.default_rng(3)
+    x = rng.standard_normal(N)
+    twin = np.column_stack([x, x + 0.05 * rng.standard_normal(N)])
+    observed = 0.5 * x + SD * rng.standard_normal(N)
+    precision = twin.T @ twin / SD**2 + np.eye(2)
+    mean = np.linalg.solve(precision, twin.T @ observed / SD**2)
+    b = rng.multivariate_normal(mean, np.linalg.inv(precision), size=(4, 500))
+    idata = xr.DataTree.from_dict({"posterior": xr.Dataset({"b": (("chain", "draw", "i"), b)})})
+    with pm.Model() as model:
+        pm.Normal("y", twin @ pm.Normal("b", 0, 1, shape=2), SD, observed=observed)
+    table = psf.relevance(idata, model, "b", random_seed=1, progressbar=False)
+    (present,) = table.index[table["prior_sd"] > 0]
+    (absent,) = table.index[table["prior_sd"] == 0]
+    assert table.loc[present, "rivals"] == absent
+    assert table.loc[present, "gain"] < 6
+    assert table.inclusion == {"b[0]": 0.5, "b[1]": 0.5}
