@@ -66,7 +66,7 @@ def run_filter(
         An earlier run, of the same system, filter, parameters, seed and t0, that goes on with these
         rows. Steps and times count from the old step 0 and come after the last old row; ``inputs``
         cover old and new steps; of a panel, every record goes on. Terms and states are those of one
-        run over all rows, bit for bit.
+        run over all rows, bit for bit (`FiniteStateFilter`: to rounding).
 
     Returns
     -------
@@ -77,14 +77,14 @@ def run_filter(
         the weights sum to one; a particle that is not finite has weight zero, and where none is
         finite mean and covariance are NaN. With `FiniteStateFilter` the particles are all values of
         the states, and ``most_probable_path`` (time, state) is the path of most probability given
-        all observations (Viterbi). ``log_likelihood`` (obs_time) holds the terms
-        log p(d_j | d_1 .. d_{j-1}). From an observation at which the filter fails on, terms are
-        -inf and states NaN. Of a panel, the dimension of the states is ``row`` instead of ``time``,
-        with the coordinates ``record``, ``step`` and ``time`` of each row, the records one below
-        the other; that of ``log_likelihood`` is ``obs``, with ``obs_record``, ``obs_step`` and
-        ``obs_time``. ``filter_state`` is what the filter goes on from with ``state``, a vector, or
-        one for each record of a panel; `GuidedPF`, which needs the record ahead, and `GridFilter`
-        have none.
+        all observations (Viterbi); not of a run that goes on. ``log_likelihood`` (obs_time) holds
+        the terms log p(d_j | d_1 .. d_{j-1}). From an observation at which the filter fails on,
+        terms are -inf and states NaN. Of a panel, the dimension of the states is ``row`` instead of
+        ``time``, with the coordinates ``record``, ``step`` and ``time`` of each row, the records
+        one below the other; that of ``log_likelihood`` is ``obs``, with ``obs_record``,
+        ``obs_step`` and ``obs_time``. ``filter_state`` is what the filter goes on from with
+        ``state``, a vector, or one for each record of a panel; `GuidedPF`, which needs the record
+        ahead, and `GridFilter` have none.
 
     Raises
     ------
@@ -179,7 +179,7 @@ def run_filter(
     dataset = dataset.assign(log_likelihood=(term_dim, np.concatenate(terms)))
     if left:
         dataset = dataset.assign(stored(left, labels))
-    if properties(filter).finds_path:
+    if properties(filter).finds_path and state is None:
         evaluate = evaluator(States(system, check_states_filter(filter), "most probable"))
         paths = [evaluate(*each, own, 0)[0] for each, own in zip(arguments, rows, strict=True)]
         dataset["most_probable_path"] = (row_dim, "state"), np.concatenate(paths)

@@ -14,12 +14,13 @@ from ..errors import ModelError
 from ..system.checks import is_integer
 from .markov_chain.backward import BACKWARD
 from .markov_chain.forward import FORWARD
-from .markov_chain.functions import chain_functions, is_smooth_in_parameters
+from .markov_chain.functions import chain_functions, is_smooth_in_parameters, table_of_states
 from .markov_chain.predictions import PREDICTIONS_OF_CHAIN
 from .markov_chain.states import MOMENTS, RUN_OF_CHAIN, STATES_OF_CHAIN
 from .plan import make_plan
 from .protocol import System, check_sensor_has_noise
 from .signatures import PREDICTIONS, RUN, STATES
+from .state_law import StateLaw, law_of_values
 from .taped import TapedFilter
 
 
@@ -50,7 +51,7 @@ class FiniteStateFilter(TapedFilter):
     -----
     Time grows with the number of transitions, one for each joint value of the states and each value
     that the noise may take there. Probabilities that depend on parameters alone are computed once
-    for an evaluation. A state whose probability is below 1e-308 of the likeliest one's is dropped.
+    for an evaluation. A state whose probability is below 1e-300 of the likeliest one's is dropped.
 
     L. R. Rabiner, "A tutorial on hidden Markov models", Proceedings of the IEEE 77 (1989). The
     gradient is the reverse of the scaled recursion, so that transitions of probability zero do no
@@ -86,6 +87,7 @@ class FiniteStateFilter(TapedFilter):
     declared: Declared = field(default=(), init=False, repr=False)
 
     finds_path: ClassVar[bool] = True
+    resumes: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         given = {} if self.values is None else self.values
@@ -157,6 +159,10 @@ class FiniteStateFilter(TapedFilter):
         n_states = len(self._finite_states(system).joint)
         return PlannedFunction(self._plan(system, RUN_OF_CHAIN, n_members=n_states), *RUN)
 
+    def law_of_state(self, system: System, states: np.ndarray) -> StateLaw:
+        """Return the law of the state, from what the filter leaves (m, S) at m points."""
+        return law_of_values(states, table_of_states(self._finite_states(system), system.n))
+
     def compile_predictions(self, system: System) -> PlannedFunction:
         """Compile the law of every observation given those before it."""
         plan = self._plan(system, PREDICTIONS_OF_CHAIN, functions=("observe",))
@@ -183,7 +189,7 @@ class FiniteStateFilter(TapedFilter):
         n_states = int(chain.settings[0])
         return make_plan(
             system, run, functions, chain.settings, **chain.entries, **entries,
-            state_size=n_states, **others,
+            state_size=1 + n_states, **others,
         )  # fmt: skip
 
 

@@ -70,6 +70,15 @@ def law_of_moments(states: Array, n: int) -> StateLaw:
     return StateLaw(np.zeros((len(states), 1)), states[:, 1:, np.newaxis], n_exact, np.arange(n))
 
 
+def law_of_values(states: Array, values: Array) -> StateLaw:
+    """Of exact states, the rows of ``values`` (K, n), from their probabilities (m, 1 + K)."""
+    (n_values, n), m = values.shape, len(states)
+    with np.errstate(divide="ignore"):
+        log_weights = np.log(states[:, 1:])
+    parts = np.broadcast_to(values.T, (m, n, n_values))
+    return StateLaw(log_weights, parts, n, np.arange(n))
+
+
 def law_of_regimes(states: Array, regimes: Array, order: NDArray[np.int64]) -> StateLaw:
     """Of Gaussians given regimes (K, n_exact), whose probabilities follow the moments of all."""
     n, (n_regimes, n_exact), m = order.size, regimes.shape, len(states)

@@ -105,8 +105,7 @@ def sample_smc(
     ModelError
         If an argument is invalid, a free variable is discrete, the prior cannot be drawn from, the
         likelihood is zero at nearly all its draws, or the data of "sequential" do not come row by
-        row: several variables, a panel, a Potential, a `GuidedPF`, `GridFilter` or
-        `FiniteStateFilter`.
+        row: several variables, a panel, a Potential, a `GuidedPF` or `GridFilter`.
 
     Warns
     -----

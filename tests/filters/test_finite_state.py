@@ -6,6 +6,7 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import pytest
+import xarray as xr
 from scipy.stats import norm, poisson
 
 import pymc_statespace_filters as psf
@@ -293,6 +294,29 @@ def test_run_shows_the_probability_of_every_state():
     weights, members = run["weights"].values[3], run["particles"].values[3]
     exact = np.cov(members.T, aweights=weights, bias=True)
     np.testing.assert_allclose(run["cov"].values[3], exact, atol=1e-12)
+
+
+@pytest.mark.parametrize("at", ["observations", "steps"])
+def test_a_run_goes_on(at):
+    """The second row of the part behind is missing, as is half of the one before."""
+    filter = psf.FiniteStateFilter()
+    whole = psf.run_filter(SWITCH, filter, GIVEN, **RECORD, at=at)
+    rows = {name: RECORD[name] for name in ("observed", "steps")}
+    first = {name: values[:1] for name, values in rows.items()}
+    before = psf.run_filter(SWITCH, filter, GIVEN, **first, inputs=RECORD["inputs"], at=at)
+    behind = {name: values[1:] for name, values in rows.items()}
+    after = psf.run_filter(
+        SWITCH, filter, GIVEN, **behind, inputs=RECORD["inputs"], at=at, state=before
+    )
+    for name, dim in (("log_likelihood", "obs_time"), ("weights", "time"), ("mean", "time")):
+        both = xr.concat([before[name], after[name]], dim)
+        np.testing.assert_allclose(both, whole[name], rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(after["filter_state"], whole["filter_state"], rtol=1e-13)
+    assert "most_probable_path" not in after
+    drawn = filter.law_of_state(
+        compile_system(SWITCH), np.tile(whole["filter_state"], (4000, 1))
+    ).drawn(np.random.default_rng(1))
+    np.testing.assert_allclose(drawn.mean(axis=0), whole["mean"][-1], atol=0.032)  # 4 errors
 
 
 @pytest.mark.parametrize("at", ["steps", "observations"])

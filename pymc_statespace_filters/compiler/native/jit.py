@@ -44,6 +44,9 @@ njit_reassoc = linked(fastmath={"contract", "reassoc"})
 inlined = linked(forceinline=True)
 """For functions inside vector loops, without fused operations: LLVM inlines them."""
 
+inlined_fused = linked(forceinline=True, fastmath={"contract"})
+"""For a few instructions inside a loop that LLVM inlines, with fused operations."""
+
 inline_always = njit(error_model="numpy", nogil=True, fastmath={"contract"}, inline="always")
 """For a few instructions inside a loop that must vectorise, fused with those of the loop.
 

@@ -17,7 +17,7 @@ from ..calls import OK, end_of_record, opened, reals_at, single_record
 from ..outcomes import NONE, is_missing
 from ..plan import NULL, PLAN
 from .forward import all_records, load_block, new_block, rows_of_tapes
-from .machine import call_members, move_probabilities, read_chain, room_for_moves
+from .machine import call_members, move_probabilities, n_states_of, read_chain, room_for_moves
 
 
 @njit_internal
@@ -71,7 +71,7 @@ def _predict_back(chain, P, f, b, new, P_bar):
 @njit_internal
 def backward_pass(chain, record, tape, end, terms_bar, theta_bar):
     """Add the derivative of one record, whose rows on the tape end before ``end``; their first."""
-    steps, K, D = record.steps, chain.n_states, chain.emission_X.shape[1]
+    steps, K = record.steps, chain.n_states
     b, new = np.zeros(K), np.empty(K)
     different, P = room_for_moves(chain)
     P_bar = np.zeros(different.size)
@@ -90,7 +90,7 @@ def backward_pass(chain, record, tape, end, terms_bar, theta_bar):
                 w += b[i] * a[i] * r[i]
             for i in range(K):
                 bar = r[i] * (terms_bar[j] + b[i] - w)
-                weights[row * D + chain.emission_number[i]] += a[i] * bar
+                weights[chain.emission_number[i] * n_at_once + row] += a[i] * bar
                 b[i] = bar
         if row == 0 and chain.emission_rows.size:
             k, t = load_block(chain, record, j, n_at_once, Z)
@@ -138,7 +138,7 @@ def _backward(plan, record, request, results):
     n_records, is_panel = given[RECORD.n_records], given[RECORD.row_width] > 1
     theta_bar = reals_at(call.results[RESULTS.theta_bar], (n_records, given[RECORD.n_theta]))
     theta_bar[:] = 0.0
-    tape = _tape_of(call, call.plan[PLAN.state_size])
+    tape = _tape_of(call, n_states_of(call.plan))
     if tape.shape[0] == 0:
         return OK
     terms_bar = reals_at(call.request[REQUEST.terms_bar], (call.request[REQUEST.n_terms_bar],))

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from ...compiler.native.jit import njit_internal
+from ...compiler.native.jit import copy_into, inlined_fused, njit_internal
 from ...compiler.native.plan import HEALTH_SIZE, RECORD, RESULTS, plan_entry
 from ...compiler.numerics.exponential import exp, log
 from ..calls import OK, end_of_record, include_health, opened, reals_at, single_record
@@ -21,25 +21,30 @@ from ..plan import PLAN
 from .machine import (
     call_members,
     move_probabilities,
+    n_states_of,
     read_chain,
     room_for_moves,
     start_probabilities,
 )
 
-# Below, the states that have a probability have densities much smaller than another state.
+# Below this mean of the densities, those of the likely states are far below that of another one.
 _SMALL = 1e-250
+# Probabilities have any unit until their sum is beyond these: a division at each observation would
+# wait for the one before.
+_LEAST_TOTAL, _MOST_TOTAL = 1e-8, 1e8
 _MOST = 700.0  # of an exponent
 
-
-@njit_internal
-def _copy_row(tape, place, rows, row):
-    """Write a row of a tape; nothing if there is none."""
-    if tape.shape[0] > 0:
-        for i in range(rows.shape[1]):
-            tape[place, i] = rows[row, i]
+_DENSITIES = 2  # a row behind two of probabilities
 
 
-@njit_internal
+@inlined_fused
+def _copy_row(tape, place, rows, row, scale):
+    """Write a multiple of a row to a tape."""
+    for i in range(rows.shape[1]):
+        tape[place, i] = scale * rows[row, i]
+
+
+@inlined_fused
 def _predict(origin, first_move, P, f, now, later):
     """Write the probabilities one step later to a row of f."""
     for i in range(f.shape[1]):
@@ -50,135 +55,147 @@ def _predict(origin, first_move, P, f, now, later):
 
 
 @njit_internal
+def _rescale(f, now, total):
+    """Divide the probabilities by their sum."""
+    for i in range(f.shape[1]):
+        f[now, i] /= total
+
+
+@njit_internal
 def new_block(chain, n_rows):
-    """How many observations are evaluated at once, and arrays: states, data, log-densities."""
+    """How many observations are evaluated at once, and arrays: states, data, log-densities.
+
+    Columns of a state are next to each other, one for each observation.
+    """
     n, D = chain.emission_X.shape
     n_at_once = max(min(chain.n_at_once, n_rows), 1)
-    size = n_at_once * D
-    X = np.empty((n, size))
+    X = np.empty((n, n_at_once * D))
     for i in range(n):
-        for row in range(n_at_once):
-            for number in range(D):
-                X[i, row * D + number] = chain.emission_X[i, number]
-    return n_at_once, X, np.zeros((chain.p, size)), np.empty((1, size))
+        for number in range(D):
+            for row in range(n_at_once):
+                X[i, number * n_at_once + row] = chain.emission_X[i, number]
+    return n_at_once, X, np.zeros((chain.p, X.shape[1])), np.empty((1, X.shape[1]))
 
 
 @njit_internal
 def load_block(chain, record, first, n_at_once, Z):
     """Load the observations from row ``first`` on; return step and time of the first."""
-    D = chain.emission_X.shape[1]
-    for row in range(first, min(first + n_at_once, record.steps.size)):
-        for b in range(Z.shape[0]):
-            value = record.observed[row, b]
-            for number in range((row - first) * D, (row - first + 1) * D):
-                Z[b, number] = value
+    observed, n_rows = record.observed, min(n_at_once, record.steps.size - first)
+    for b in range(Z.shape[0]):
+        for row in range(n_rows):
+            Z[b, row] = observed[first + row, b]
+        for at in range(n_at_once, Z.shape[1], n_at_once):
+            for row in range(n_rows):
+                Z[b, at + row] = Z[b, row]
     k = record.steps[first]
     return k, record.t0 + k * chain.dt
 
 
 @njit_internal
-def _densities(log_p, D, shifts, E):
+def _densities(log_p, n_at_once, shifts, E):
     """Write densities over the largest of an observation, whose logarithm is its shift."""
-    for row in range(shifts.size):
-        largest = -np.inf
-        for number in range(row * D, (row + 1) * D):
-            value = log_p[0, number]
-            largest = value if value > largest else largest  # NaN is not
-        shifts[row] = largest
-        for number in range(row * D, (row + 1) * D):
-            E[number] = log_p[0, number] - largest
-    for number in range(E.size):
-        E[number] = exp(E[number])
+    n_rows = min(n_at_once, shifts.size)
+    shifts[:n_rows] = -np.inf
+    for at in range(0, E.size, n_at_once):
+        for row in range(n_rows):
+            value = log_p[0, at + row]
+            shifts[row] = value if value > shifts[row] else shifts[row]  # NaN is not
+    for at in range(0, E.size, n_at_once):
+        for row in range(n_rows):
+            E[at + row] = log_p[0, at + row] - shifts[row]
+    for i in range(E.size):
+        E[i] = exp(E[i])
 
 
-@njit_internal
-def _update(number, E, log_p, first, shift, f, before, after, r):
-    """Write r and a row of f; return s and the logarithm of its unit. s is NaN without a density.
+@inlined_fused
+def _weigh(first, E, row, f, now):
+    """Write densities of an observation, and f times these to the other row; return their sum.
 
-    The densities of the observation are those from ``first`` on.
+    The densities are those ``row`` places behind the ``first`` one of each state.
     """
     s = 0.0
-    for i in range(number.size):
-        s += f[before, i] * E[first + number[i]]
-    if s > _SMALL and s < np.inf:
-        scale = 1.0 / s
-        for i in range(number.size):
-            r[0, i] = scale * E[first + number[i]]
-            f[after, i] = f[before, i] * r[0, i]
-        return s, shift
-    s, shift = _update_by_logs(number, log_p, first, f, before, r)
-    if not (s > 0.0 and s < np.inf):
-        return np.nan, shift
-    for i in range(number.size):
-        r[0, i] /= s
-        f[after, i] = f[before, i] * r[0, i]
-    return s, shift
+    for i in range(first.size):
+        f[_DENSITIES, i] = E[first[i] + row]
+        f[1 - now, i] = f[now, i] * f[_DENSITIES, i]
+        s += f[1 - now, i]
+    return s
 
 
 @njit_internal
-def _update_by_logs(number, log_p, first, f, before, r):
-    """Write densities over the largest of a possible state; return their mean, and its log."""
+def _weigh_by_logs(first, log_p, row, f, now):
+    """The same with densities over the largest of a possible state, and the log of that."""
     largest, s = -np.inf, 0.0
-    for i in range(number.size):
-        value = log_p[0, first + number[i]]
-        if f[before, i] > 0.0 and value > largest:
+    for i in range(first.size):
+        value = log_p[0, first[i] + row]
+        if f[now, i] > 0.0 and value > largest:
             largest = value
-    for i in range(number.size):
-        value = log_p[0, first + number[i]]
-        r[0, i] = 0.0
+    for i in range(first.size):
+        value = log_p[0, first[i] + row]
+        f[_DENSITIES, i] = 0.0
         if largest > -np.inf and value > -np.inf:
-            r[0, i] = math.exp(min(value - largest, _MOST))
-            s += f[before, i] * r[0, i]
+            f[_DENSITIES, i] = math.exp(min(value - largest, _MOST))
+        f[1 - now, i] = f[now, i] * f[_DENSITIES, i]
+        s += f[1 - now, i]
     return s, largest
 
 
 @njit_internal
-def _why(number, log_p, first, f, before):
+def _why(first, log_p, row, f, now):
     """Why an observation has no density at the possible states."""
-    for i in range(number.size):
-        if f[before, i] > 0.0 and log_p[0, first + number[i]] == -np.inf:
+    for i in range(first.size):
+        if f[now, i] > 0.0 and log_p[0, first[i] + row] == -np.inf:
             return np.int64(ZERO_DENSITY)
     return np.int64(OBSERVATION_UNDEFINED)
 
 
 @njit_internal
-def forward_pass(chain, record, terms, tape):
-    """Write terms and the tape: (NONE, its rows), or (a reason, the failing observation)."""
+def forward_pass(chain, record, before, terms, tape):
+    """Write terms and the tape: (NONE, its rows), or (a reason, the failing observation).
+
+    ``before`` is the state from which the filter goes on, a step and probabilities, or empty.
+    """
     shifts = np.zeros(terms.size)
-    code, end = _along(chain, record, terms, shifts, tape)
+    code, end = _along(chain, record, before, terms, shifts, tape)
     for j in range(terms.size if code == NONE else end):
         terms[j] = shifts[j] + log(terms[j])
     return code, end
 
 
 @njit_internal
-def _along(chain, record, means, shifts, tape):
-    """The same with the mean s of an observation's densities, and the log of its unit.
+def _along(chain, record, before, means, shifts, tape):
+    """The same with the mean of an observation's densities, and the log of its unit.
 
     Arrays are taken out of their tuples before the loop, and no part of one is taken in it: both
-    would count references there.
+    would count references there. ``total`` is the sum of the probabilities f.
     """
     steps, observed, inputs = record.steps, record.observed, record.inputs
-    origin, first_move, number = chain.origin, chain.first_move, chain.emission_number
-    f, r, now = np.empty((2, chain.n_states)), np.empty((1, chain.n_states)), 0
+    origin, first_move = chain.origin, chain.first_move
+    f, now, total = np.empty((3, chain.n_states)), 0, 1.0
     different, P = room_for_moves(chain)
     n_at_once, X, Z, log_p = new_block(chain, steps.size)
-    D, E, shift_of_row = X.shape[1] // n_at_once, np.empty(X.shape[1]), np.empty(n_at_once)
+    E, is_taped = np.empty(X.shape[1]), tape.shape[0] > 0
+    first = chain.emission_number * n_at_once
     if chain.failure != NONE:
         return np.int64(chain.failure), np.int64(0)
-    code = start_probabilities(chain, inputs, f[0])
+    k, code = np.int64(0), np.int64(NONE)
+    if before.size:
+        k = np.int64(before[0])
+        copy_into(f[0], before[1:])
+    else:
+        code = start_probabilities(chain, inputs, f[0])
     if code == NONE and chain.is_invariant:
         code = move_probabilities(chain, inputs, 0, record.t0, different, P)
     if code != NONE:
         return code, np.int64(0)
-    k, place, row = np.int64(0), np.int64(0), n_at_once
+    place, row = np.int64(0), n_at_once
     for j in range(steps.size):
         while k < steps[j]:
             if not chain.is_invariant:
                 code = move_probabilities(chain, inputs, k, record.t0, different, P)
                 if code != NONE:
                     return code, np.int64(j)
-            _copy_row(tape, place, f, now)
+            if is_taped:
+                _copy_row(tape, place, f, now, 1.0 / total)
             _predict(origin, first_move, P, f, now, 1 - now)
             now = 1 - now
             place += 1
@@ -186,22 +203,29 @@ def _along(chain, record, means, shifts, tape):
         if row == n_at_once:
             at, t = load_block(chain, record, j, n_at_once, Z)
             call_members(chain.emission, chain.c, inputs, at, t, Z, X, log_p)
-            _densities(log_p, D, shift_of_row, E)
+            _densities(log_p, n_at_once, shifts[j:], E)
             row = 0
         if is_missing(observed, j):
-            means[j] = 1.0
+            means[j], shifts[j] = 1.0, 0.0
         else:
-            first = row * D
-            s, shift = _update(number, E, log_p, first, shift_of_row[row], f, now, 1 - now, r)
-            if np.isnan(s):
-                return _why(number, log_p, first, f, now), np.int64(j)
-            means[j], shifts[j] = s, shift
-            _copy_row(tape, place, f, now)
-            _copy_row(tape, place + 1, r, 0)
-            now = 1 - now
+            s = _weigh(first, E, row, f, now)
+            is_usual = s > _LEAST_TOTAL and s < _MOST_TOTAL
+            if not is_usual and not (s > _SMALL * total and s < np.inf):
+                s, shifts[j] = _weigh_by_logs(first, log_p, row, f, now)
+                if not (s > 0.0 and s < np.inf):
+                    return _why(first, log_p, row, f, now), np.int64(j)
+            means[j] = s / total
+            if is_taped:
+                _copy_row(tape, place, f, now, 1.0 / total)
+                _copy_row(tape, place + 1, f, _DENSITIES, total / s)
+            now, total = 1 - now, s
             place += 2
+            if not is_usual:
+                _rescale(f, now, s)
+                total = 1.0
         row += 1
-    _copy_row(tape, place, f, now)
+    if is_taped:
+        _copy_row(tape, place, f, now, 1.0 / total)
     return np.int64(NONE), place + 1
 
 
@@ -240,7 +264,7 @@ def all_records(call, terms, healths, tape):
         own = terms[begin : begin + record.steps.size]
         own[:] = -np.inf
         chain = read_chain(call.plan, record.theta, record.inputs)
-        code, end = forward_pass(chain, record, own, tape[place:])
+        code, end = forward_pass(chain, record, np.empty(0), own, tape[place:])
         health = np.empty(HEALTH_SIZE) if is_panel else healths[number]
         health[0], health[1], health[2] = np.inf, code, -1.0
         if code != NONE:
@@ -258,7 +282,7 @@ def _forward(plan, record, request, results):
     status, call = opened(plan, record, request, results)
     if status != OK:
         return status
-    to, n_states = call.results, call.plan[PLAN.state_size]
+    to, n_states = call.results, n_states_of(call.plan)
     if call.plan[PLAN.leaves_tape]:
         to[RESULTS.n_tape], to[RESULTS.tape_width] = rows_of_tapes(call), n_states
     if call.request[0]:

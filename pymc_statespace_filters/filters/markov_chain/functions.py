@@ -63,7 +63,7 @@ def chain_functions(system: System, declared: Declared) -> ChainFunctions:
     start = _Function("start", *_start(model), c, system.n_theta)
     move = _Function("move", *_move(model), c, system.n_theta)
     emission = _Function("emission", *_emission(model), c, system.n_theta)
-    moves, table = _by_successor(found.step), _states(found, model.n)
+    moves, table = _by_successor(found.step), table_of_states(found, model.n)
     of_move = move.distinct(table[moves.origin], moves.values)
     of_state = emission.distinct(table)
     settings = sizes_and_tables(
@@ -91,7 +91,7 @@ def _by_successor(moves: Moves) -> Moves:
     return Moves(moves.origin[order], moves.values[order], moves.successor[order])
 
 
-def _states(found: FiniteStates, n: int) -> np.ndarray:
+def table_of_states(found: FiniteStates, n: int) -> np.ndarray:
     """The states (K, n) of all joint values."""
     table = np.zeros((len(found.joint), n))
     table[:, list(found.indices)] = found.joint

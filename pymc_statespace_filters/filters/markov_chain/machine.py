@@ -7,7 +7,7 @@ import numpy as np
 
 from ...compiler.codegen.arguments import MemberArguments
 from ...compiler.native.entry_point import call_address
-from ...compiler.native.jit import njit_internal
+from ...compiler.native.jit import inline_always, njit_internal
 from ..outcomes import INVALID_PROBABILITY, NONE
 from ..plan import NULL, PLAN, read_system, settings_of
 
@@ -97,6 +97,12 @@ def _whole(values, size):
     for i in range(size):
         out[i] = int(values[i])
     return out
+
+
+@inline_always
+def n_states_of(plan):
+    """The number of states; the state of the filter is a step, and their probabilities."""
+    return plan[PLAN.state_size] - 1
 
 
 @njit_internal

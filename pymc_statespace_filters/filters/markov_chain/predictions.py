@@ -30,7 +30,7 @@ def _predictions(plan, record, request, results):
     system = read_system(call.plan, data.theta, data.inputs)
     chain = read_chain(call.plan, data.theta, data.inputs)
     tape = np.empty((rows_on_tape(data.steps), chain.n_states))
-    code, end = forward_pass(chain, data, np.empty(J), tape)
+    code, end = forward_pass(chain, data, np.empty(0), np.empty(J), tape)
     known = J if code == NONE else int(end)
     weights = predicted_at_observations(chain, data, tape, known)
     for j in range(known):

@@ -12,10 +12,19 @@ import math
 
 import numpy as np
 
-from ...compiler.native.jit import njit_internal
-from ...compiler.native.plan import HEALTH_SIZE, RECORD, REQUEST, RESULTS, plan_entry
+from ...compiler.native.jit import copy_into, njit_internal
+from ...compiler.native.plan import HEALTH_SIZE, RECORD, REQUEST, RESULTS, STATE, plan_entry
 from ...compiler.numerics.philox import STATES, uniform_at
-from ..calls import OK, first_unknown, opened, reals_at, single_record, wanted_rows
+from ..calls import (
+    OK,
+    first_unknown,
+    opened,
+    reals_at,
+    single_record,
+    state_given,
+    state_wanted,
+    wanted_rows,
+)
 from ..outcomes import NONE, OUT_OF_MEMORY, is_missing
 from ..plan import PLAN
 from .forward import forward_pass, rows_on_tape
@@ -60,11 +69,14 @@ def predicted_at_observations(chain, record, tape, known):
 
 
 @njit_internal
-def _read_forwards(chain, record, tape, rows, end, moment, seed, probabilities, paths):
-    """Write the predicted or filtered probabilities at the rows, and independent draws."""
+def _read_forwards(chain, record, tape, rows, first, end, moment, seed, probabilities, paths):
+    """Write the predicted or filtered probabilities at the rows, and independent draws.
+
+    The tape begins at step ``first``, and is known in front of step ``end``.
+    """
     place, j, r, steps = np.int64(0), 0, 0, record.steps
     last = min(end, steps[-1] + 1) if steps.size else np.int64(0)
-    for k in range(last):
+    for k in range(first, last):
         is_seen = j < steps.size and steps[j] == k
         is_informed = is_seen and not is_missing(record.observed, j)
         at = place + 2 if is_informed and moment == FILTERED else place
@@ -129,7 +141,10 @@ def _read_path(chain, record, tape, rows, probabilities, paths):
 
 @njit_internal
 def _probabilities(call, rows, moment, paths):
-    """The chain, and probabilities (R, K) of its states at the rows: NaN where unknown."""
+    """The chain, and probabilities (R, K) of its states at the rows: NaN where unknown.
+
+    The filter may go on from earlier rows. What it leaves is written where it is wanted.
+    """
     to, J = call.results, call.record[RECORD.n_rows]
     record = single_record(call, 0, 0, J)
     terms = reals_at(to[RESULTS.terms], (J,)) if to[RESULTS.terms] != 0 else np.empty(J)
@@ -139,11 +154,17 @@ def _probabilities(call, rows, moment, paths):
     chain = read_chain(call.plan, record.theta, record.inputs)
     probabilities = np.full((rows.size, chain.n_states), np.nan)
     tape = np.empty((rows_on_tape(record.steps), chain.n_states))
-    code, end = forward_pass(chain, record, terms, tape)
+    before, after = state_given(call.request), state_wanted(call)
+    code, end = forward_pass(chain, record, before, terms, tape)
     health[1], health[2] = code, -1.0
     if code != NONE:
         health[2] = end
         terms[int(end) :] = -np.inf
+    if after.size:
+        after[:] = np.nan
+        if code == NONE and record.steps.size:
+            after[0] = record.steps[-1]
+            copy_into(after[1:], tape[end - 1])
     seed = call.request[REQUEST.draw_seed]
     if moment == SMOOTHED:
         if code == NONE:
@@ -152,8 +173,8 @@ def _probabilities(call, rows, moment, paths):
         if code == NONE:
             _read_path(chain, record, tape, rows, probabilities, paths)
     else:
-        known = first_unknown(call, health)
-        _read_forwards(chain, record, tape, rows, known, moment, seed, probabilities, paths)
+        first, known = np.int64(before[0]) if before.size else 0, first_unknown(call, health)
+        _read_forwards(chain, record, tape, rows, first, known, moment, seed, probabilities, paths)
     return chain, probabilities
 
 
@@ -196,7 +217,12 @@ def _states(plan, record, request, results):
 
 def _run(plan, record, request, results):
     status, call = opened(plan, record, request, results)
-    if status != OK or call.request[REQUEST.sizes_only]:
+    if status != OK:
+        return status
+    n_before = call.request[REQUEST.n_state]
+    if n_before != 0 and n_before != call.results[RESULTS.n_state]:
+        return np.int64(STATE)
+    if call.request[REQUEST.sizes_only]:
         return status
     rows, to, n = wanted_rows(call), call.results, call.plan[PLAN.n]
     chain, found = _probabilities(call, rows, FILTERED, np.zeros(rows.size, np.int64))
