@@ -19,7 +19,9 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
+from pytensor.graph.basic import Variable, equal_computations
 from pytensor.graph.traversal import ancestors
+from pytensor.tensor.random.type import RandomType
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse.csgraph import connected_components
 from scipy.special import gammaln
@@ -27,7 +29,7 @@ from scipy.special import gammaln
 from ..pymc_model.density import ConstrainedDensity
 from ..pymc_model.prior import is_restricted
 
-MOST_LABELS, MOST_AXES = 8, 6
+MOST_LABELS, MOST_PLACES = 8, 6
 N_POINTS, N_SEEDS = 4, 8  # draws at which densities are compared; estimates of a noisy one
 ROUNDING, MAX_ERROR = 1e-7, 1.0  # relative; in nats, of a noisy difference
 N_ORDERED = 400  # draws whose order is found
@@ -39,29 +41,63 @@ Draws = Mapping[str, Array]
 
 
 class Axis(NamedTuple):
-    """An axis of a free variable."""
+    """Labels along an axis of a free variable."""
 
     name: str
     number: int
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The variables that have the labels."""
+        return (self.name,)
+
+    @property
+    def parts(self) -> tuple["Axis", ...]:
+        """What no other labels may have."""
+        return (self,)
+
+    def permuted(self, points: Draws, order: NDArray[np.int64]) -> Draws:
+        """The points with other labels."""
+        changed = np.take(points[self.name], order, axis=self.number + 1)
+        return {**points, self.name: changed}
+
+
+class Scalars(NamedTuple):
+    """Labels of scalar variables, one for each, in this order."""
+
+    names: tuple[str, ...]
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """What no other labels may have."""
+        return self.names
+
+    def permuted(self, points: Draws, order: NDArray[np.int64]) -> Draws:
+        """The points with other labels."""
+        changed = {name: points[self.names[i]] for name, i in zip(self.names, order, strict=True)}
+        return {**points, **changed}
+
+
+type Place = Axis | Scalars
+
 
 @dataclass(frozen=True)
 class Labels:
-    """K labels that may be exchanged, along these axes.
+    """K labels that may be exchanged, in these places.
 
     ``lacking`` is the logarithm of the number of parts of the posterior over those that the draws
     visit; ``ordered`` are the variables of which a transform leaves one part of the prior.
     """
 
     count: int
-    axes: tuple[Axis, ...]
+    places: tuple[Place, ...]
     lacking: float
     ordered: tuple[str, ...]
 
     @property
     def names(self) -> list[str]:
         """Names of the variables that have the labels."""
-        return list(dict.fromkeys(axis.name for axis in self.axes))
+        return list(dict.fromkeys(name for place in self.places for name in place.names))
 
 
 def exchangeable_labels(
@@ -73,16 +109,15 @@ def exchangeable_labels(
         rv.name: _flat(posterior[rv.name].transpose("chain", "draw", ...).values)
         for rv in model.free_RVs
     }
-    by_length = _axes_by_length(draws)
-    if not by_length:
+    by_count = _places_by_count(draws, _alike_scalars(model))
+    if not by_count:
         return []
     test = _InvarianceTest(model, draws, rng)
-    best = int(np.argmax(log_density))
-    return [
-        _found(model, draws, count, axes, best)
-        for count, all_axes in by_length.items()
-        for axes in _invariant_axes(test, all_axes, count)
-    ]
+    best, taken, found = int(np.argmax(log_density)), set[Axis | str](), list[Labels]()
+    for count in sorted(by_count, reverse=True):  # two of three scalars are no labels of their own
+        for places in _invariant_places(test, by_count[count], count, taken):
+            found.append(_found(model, draws, count, places, best))
+    return found
 
 
 def uncounted_orders(model: pm.Model, found: Sequence[Labels]) -> Iterator[str]:
@@ -110,28 +145,58 @@ def _flat(values: Array) -> Array:
     return values.reshape(-1, *values.shape[2:]).astype(np.float64)
 
 
-def _axes_by_length(draws: Draws) -> dict[int, list[Axis]]:
-    found: dict[int, list[Axis]] = {}
+def _alike_scalars(model: pm.Model) -> list[list[str]]:
+    """Names of scalar variables of the same prior distribution, at least two."""
+    groups: list[list[Variable]] = []
+    for rv in model.free_RVs:
+        alike = [group for group in groups if _have_one_prior(group[0], rv)]
+        if alike:
+            alike[0].append(rv)
+        elif rv.ndim == 0:
+            groups.append([rv])
+    return [[str(rv.name) for rv in group] for group in groups if len(group) > 1]
+
+
+def _have_one_prior(one: Variable, other: Variable) -> bool:
+    """Whether the distributions of two variables have the same form and parameters."""
+    if one.type != other.type or type(one.owner.op) is not type(other.owner.op):
+        return False
+    first, second = (
+        [x for x in rv.owner.inputs if not isinstance(x.type, RandomType)] for rv in (one, other)
+    )
+    return len(first) == len(second) and equal_computations(first, second)
+
+
+def _places_by_count(draws: Draws, alike: Sequence[Sequence[str]]) -> dict[int, list[Place]]:
+    """Where labels may be, by their number."""
+    found: dict[int, list[Place]] = {}
     for name, values in draws.items():
         for number, length in enumerate(values.shape[1:]):
             if 2 <= length <= MOST_LABELS:
                 found.setdefault(length, []).append(Axis(name, number))
+    for names in alike:
+        for count in range(2, min(len(names), MOST_LABELS) + 1):
+            groups = [Scalars(some) for some in combinations(names, count)]
+            if len(groups) + len(found.get(count, [])) <= MOST_PLACES:
+                found.setdefault(count, []).extend(groups)
     return found
 
 
-def _invariant_axes(
-    test: "_InvarianceTest", axes: Sequence[Axis], count: int
-) -> Iterator[tuple[Axis, ...]]:
-    """Yield the smallest disjoint sets of axes whose labels may be exchanged.
+def _invariant_places(
+    test: "_InvarianceTest", places: Sequence[Place], count: int, taken: set[Axis | str]
+) -> Iterator[tuple[Place, ...]]:
+    """Yield the smallest disjoint sets of places whose labels may be exchanged, and take them.
 
-    Of many axes only all together are tried.
+    Of many places only all together are tried.
     """
-    taken: set[Axis] = set()
-    sizes = range(1, len(axes) + 1) if len(axes) <= MOST_AXES else [len(axes)]
+    sizes = range(1, len(places) + 1) if len(places) <= MOST_PLACES else [len(places)]
     for size in sizes:
-        for some in combinations(axes, size):
-            if not taken & set(some) and test.is_invariant(some, count):
-                taken |= set(some)
+        for some in combinations(places, size):
+            parts = [part for place in some for part in place.parts]
+            if len(set(parts)) < len(parts) or taken & set(parts):
+                continue
+            if test.is_invariant(some, count):
+                taken |= set(parts)
                 yield some
 
 
@@ -150,17 +215,17 @@ class _InvarianceTest:
         self._rng = rng
         self._before = self._values(self._points)
 
-    def is_invariant(self, axes: Sequence[Axis], count: int) -> bool:
+    def is_invariant(self, places: Sequence[Place], count: int) -> bool:
         """Whether all permutations of the labels do: those of two neighbours generate them."""
-        return all(self._is_same_with(axes, count, i) for i in range(count - 1))
+        return all(self._is_same_with(places, count, i) for i in range(count - 1))
 
-    def _is_same_with(self, axes: Sequence[Axis], count: int, label: int) -> bool:
+    def _is_same_with(self, places: Sequence[Place], count: int, label: int) -> bool:
         """Whether the label and the next one may be exchanged."""
         order = np.arange(count)
         order[[label, label + 1]] = label + 1, label
-        points = dict(self._points)
-        for name, number in axes:
-            points[name] = np.take(points[name], order, axis=number + 1)
+        points: Draws = self._points
+        for place in places:
+            points = place.permuted(points, order)
         with np.errstate(invalid="ignore"):
             change = self._values(points) - self._before
         if not np.isfinite(change).all():
@@ -179,10 +244,13 @@ class _InvarianceTest:
         return self._density.evaluate(np.tile(x, (n_rows, 1)), seeds).reshape(n_rows, N_POINTS)
 
 
-def _found(model: pm.Model, draws: Draws, count: int, axes: tuple[Axis, ...], best: int) -> Labels:
+def _found(
+    model: pm.Model, draws: Draws, count: int, places: tuple[Place, ...], best: int
+) -> Labels:
+    axes = [place for place in places if isinstance(place, Axis)]
     ordered = tuple(axis.name for axis in axes if _keeps_order(model, draws, axis))
-    visited = 0.0 if ordered else _log_visited(_features(draws, axes), best)
-    return Labels(count, axes, float(gammaln(count + 1)) - visited, ordered)
+    visited = 0.0 if ordered else _log_visited(_features(draws, places), best)
+    return Labels(count, places, float(gammaln(count + 1)) - visited, ordered)
 
 
 def _keeps_order(model: pm.Model, draws: Draws, axis: Axis) -> bool:
@@ -191,15 +259,20 @@ def _keeps_order(model: pm.Model, draws: Draws, axis: Axis) -> bool:
     return bool(is_sorted and is_restricted(model[axis.name], model))
 
 
-def _features(draws: Draws, axes: Sequence[Axis]) -> Array:
+def _features(draws: Draws, places: Sequence[Place]) -> Array:
     """What each draw says of each label, (draw, label, feature): of a matrix the diagonal."""
-    columns = []
+    axes = [place for place in places if isinstance(place, Axis)]
+    columns = [
+        np.stack([draws[name] for name in place.names], axis=1)[:, :, np.newaxis]
+        for place in places
+        if isinstance(place, Scalars)
+    ]
     for name in dict.fromkeys(axis.name for axis in axes):
         numbers = [axis.number + 1 for axis in axes if axis.name == name]
         values = np.moveaxis(draws[name], numbers, range(1, 1 + len(numbers)))
         label = np.arange(values.shape[1])
-        place: tuple[Any, ...] = (slice(None), *[label] * len(numbers))
-        own = values[place]
+        diagonal: tuple[Any, ...] = (slice(None), *[label] * len(numbers))
+        own = values[diagonal]
         columns.append(own.reshape(*own.shape[:2], -1))
     return np.concatenate(columns, axis=2)
 

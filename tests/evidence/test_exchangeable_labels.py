@@ -181,7 +181,7 @@ def test_the_labels_of_regimes_are_found_in_both_axes_of_their_matrix(filter):
     found = exchangeable_labels(model, idata, np.zeros((2, 100)), rng)
     (labels,) = [one for one in found if one.names != ["noise"]]
     assert labels.names == ["P", "mean"]
-    assert len(labels.axes) == 3
+    assert len(labels.places) == 3
     assert labels.lacking == pytest.approx(np.log(2))
     assert all(one.lacking == 0.0 for one in found if one is not labels)
 
@@ -196,3 +196,51 @@ def test_nothing_is_evaluated_without_an_axis_of_labels():
             {"posterior": xr.Dataset({"mu": (("chain", "draw"), values)})}
         )
         assert exchangeable_labels(model, idata, values, np.random.default_rng(6)) == []
+
+
+def scalar_labels(rng):
+    """Two states whose means and probabilities to leave are scalars, and two sensors beside them.
+
+    Draws stay in one order of the states, and the sensors are no labels.
+    """
+    with pm.Model() as model:
+        low, high = (pm.Normal(name, 0, 5) for name in ("low", "high"))
+        up, down = (pm.Beta(name, 1, 9) for name in ("up", "down"))
+        first, second = (pm.HalfNormal(name, 1) for name in ("first", "second"))
+        share = down / (up + down)
+        parts = [
+            pt.log(share) + pm.logp(pm.Normal.dist(low, first), DATA),
+            pt.log(1 - share) + pm.logp(pm.Normal.dist(high, first), DATA),
+        ]
+        pm.Potential("likelihood", pt.logaddexp(*parts).sum() - second)
+    centres = {"low": -2.0, "high": 2.0, "up": 0.1, "down": 0.15, "first": 0.9, "second": 0.5}
+    draws = {
+        name: (("chain", "draw"), centre + 0.02 * rng.standard_normal((2, 100)))
+        for name, centre in centres.items()
+    }
+    return model, xr.DataTree.from_dict({"posterior": xr.Dataset(draws)})
+
+
+def test_labels_of_scalars_are_found():
+    rng = np.random.default_rng(7)
+    model, idata = scalar_labels(rng)
+    (labels,) = exchangeable_labels(model, idata, np.zeros((2, 100)), rng)
+    assert sorted(labels.names) == ["down", "high", "low", "up"]
+    assert labels.lacking == pytest.approx(np.log(2))
+
+
+def test_three_scalars_are_three_labels_and_no_pairs():
+    rng = np.random.default_rng(8)
+    with pm.Model() as model:
+        means = [pm.Normal(f"mean_{k}", 0, 5) for k in range(3)]
+        pm.Normal("other", 0, 5, shape=2)
+        pm.Potential("likelihood", -pt.sum(pt.stack(means) ** 4) * 1e-3 + model["other"][0])
+    draws = {
+        f"mean_{k}": (("chain", "draw"), 3.0 * k + 0.1 * rng.standard_normal((2, 100)))
+        for k in range(3)
+    }
+    draws["other"] = (("chain", "draw", "i"), rng.standard_normal((2, 100, 2)))
+    idata = xr.DataTree.from_dict({"posterior": xr.Dataset(draws)})
+    (labels,) = exchangeable_labels(model, idata, np.zeros((2, 100)), rng)
+    assert labels.names == ["mean_0", "mean_1", "mean_2"]
+    assert labels.lacking == pytest.approx(np.log(6))

@@ -425,7 +425,7 @@ def test_means_of_probabilities_are_those_of_a_grid(kind):
     values = symbols_of(system)
     drawn = [pt.constant(v) for v in hybrid.drawn]
     outputs = [*draws_of(hybrid, values, pt.zeros(1), s, drawn)[1]]
-    outputs += [pytensor.grad(outputs[0], s)] if kind == "even" else []
+    outputs += [pytensor.grad(outputs[0], s)] if kind in ("even", "line") else []
     given = pytensor.function([s], outputs, mode=AS_IT_STANDS)
     gaussian = np.array([0.0, 0.0, 1.0, 0.3, 0.8])  # mean, lower triangle of the covariance
     weight, state, *slopes = given(gaussian)
