@@ -214,8 +214,8 @@ def test_filtered_and_predicted_states():
             np.testing.assert_allclose(mean[moment][k, 0], expected, rtol=1e-12)
 
 
-# Moves that depend on time, a sensor that depends on inputs and time, and a state at the start to
-# which nothing leads.
+# Moves that depend on time, a sensor that depends on inputs and time, and a start between the
+# states, to which nothing leads.
 SEASON = psf.StateSpaceModel(
     transition=lambda x, q: [1.0 + q[0]],
     process_dist=lambda x, t, swing: [
@@ -223,7 +223,7 @@ SEASON = psf.StateSpaceModel(
     ],
     observation=lambda x, u, t, level: [level * x[0] * u[0] + 0.2 * t],
     observation_noise=[[0.3]],
-    initial_mean=[0.0],
+    initial_mean=[1.5],
     initial_cov=[[0.0]],
     inputs=["gain"],
     dt=0.5,
@@ -239,7 +239,7 @@ SEASONS = {
 
 def season_paths(swing, level, observed, steps, inputs, t0):
     """All paths of the state, and log p(path, data) of each."""
-    paths = np.array([(0, *path) for path in itertools.product((1, 2), repeat=steps[-1])])
+    paths = np.array([(1.5, *path) for path in itertools.product((1, 2), repeat=steps[-1])])
     t, log_p = t0 + 0.5 * np.arange(steps[-1] + 1), np.zeros(len(paths))
     for k in range(steps[-1]):
         up = 1 / (1 + np.exp(-swing * np.sin(t[k]) - np.where(paths[:, k] > 1, 0.7, -0.3)))
