@@ -32,6 +32,7 @@ from .filters import (
     GuidedPF,
     PFEnKF,
 )
+from .parallel.ranks import Ranks
 from .parameter_particles import compare_prequential, extend, sample_smc
 from .plots import (
     plot_average,
@@ -54,7 +55,6 @@ from .rivals import run_models
 from .sampling import (
     DRAM,
     RandomWalkSettings,
-    Ranks,
     find_starts,
     sample,
     sample_dram,

@@ -119,9 +119,9 @@ def run_models(
     if sampler == "smc":
         if pilot is not None:
             raise ModelError("pilot must be None with sampler='smc', which starts from the prior")
-        if checkpoint is not None or comm is not None:
-            raise ModelError("checkpoint and comm must be None with sampler='smc'")
-        return _particles(models, settings)
+        if checkpoint is not None:
+            raise ModelError("checkpoint must be None with sampler='smc'")
+        return _particles(models, settings, comm)
     given = RunArguments(**settings)
     requests = warm_started_models(given.request(), models, pilot)
     return sample_models(models, requests, given.options(comm), folders)
@@ -140,15 +140,19 @@ def _check_models(models: Mapping[str, Model]) -> None:
             raise ModelError(f"models[{name!r}] must be a pymc.Model, got {model!r}")
 
 
-def _particles(models: Mapping[str, Model], settings: Mapping[str, Any]) -> dict[str, DataTree]:
-    """Every model by `sample_smc`, with the same seed."""
+def _particles(
+    models: Mapping[str, Model], settings: Mapping[str, Any], comm: Any
+) -> dict[str, DataTree] | None:
+    """Every model by `sample_smc`, with the same seed; None on ranks that do not get them."""
     seed, found = settings.get("random_seed"), {}
     for name, model in models.items():
         # Each gets the numbers that a generator would give the first.
         own = deepcopy(seed) if isinstance(seed, np.random.Generator) else seed
         try:
-            found[name] = sample_smc(model=model, **{**settings, "random_seed": own})
+            tree = sample_smc(model=model, comm=comm, **{**settings, "random_seed": own})
         except Exception as error:
             error.add_note(f"in model {name!r}")
             raise
-    return found
+        if tree is not None:
+            found[name] = tree
+    return found or None

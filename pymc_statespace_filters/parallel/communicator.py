@@ -21,8 +21,8 @@ from .mpi import check_threads, mpi, mpi_communicator
 
 _MAX_LAYOUTS = 256
 
-# Interval at which a waiting rank polls: polling without a pause takes a core.
-_POLL_SECONDS = 0.005
+# Intervals at which a waiting rank polls, from short to long: without pauses it takes a core.
+_FIRST_POLL_SECONDS, _POLL_SECONDS = 0.00005, 0.005
 # Time for the failed rank to report first, because the first rank to end may end the whole job.
 ABORT_GRACE_SECONDS = 1.0
 _MAX_BYTES = 2**28  # of one message
@@ -113,6 +113,7 @@ class Communicator:
         self.rank: int = 0 if self._comm is None else self._comm.Get_rank()
         self.size: int = 1 if self._comm is None else self._comm.Get_size()
         self._sent: list[Any] = []
+        self._known: BaseException | None = None  # the last error that all ranks have been told of
 
     def __enter__(self) -> Self:
         return self
@@ -135,9 +136,10 @@ class Communicator:
     def barrier(self) -> None:
         """Wait for all ranks without keeping a core busy."""
         if self._comm is not None:
-            request = self._comm.Ibarrier()
+            request, pause = self._comm.Ibarrier(), _FIRST_POLL_SECONDS
             while not request.Test():
-                time.sleep(_POLL_SECONDS)
+                time.sleep(pause)
+                pause = min(1.5 * pause, _POLL_SECONDS)
 
     def allgather(self, value: Any) -> list[Any]:
         """The values of all ranks, on all of them."""
@@ -153,33 +155,68 @@ class Communicator:
         self.barrier()
         return self._comm.bcast(value)
 
-    def run_collectively(self, function: Callable[[], Result]) -> Result:
+    def run_collectively(self, function: Callable[[], Result], mark: int = 0) -> Result:
         """Call a function on every rank, and give its result here; if one raises, all do.
+
+        ``mark`` says what the function does, the same on all ranks.
 
         Raises
         ------
         Exception
             What the function raised here.
         ParallelError
-            If it raised on another rank, which the message names.
+            If it raised on another rank, which the message names; or if the marks differ.
         """
         try:
             result, failure = function(), None
         except BaseException as error:  # an interrupt too: the others are waiting
+            if self._is_known(error):
+                raise
             failure = error
-        reports = self.allgather(None if failure is None else describe_error(failure))
+        report = None if failure is None else describe_error(failure)
+        reports, marks = zip(*self.allgather((report, mark)), strict=True)
         failed = [rank for rank, report in enumerate(reports) if report is not None]
+        differing = [rank for rank, one in enumerate(marks) if one != marks[0]]
+        if not (failed or differing):
+            return result
         if failed and self.rank != failed[0]:
             time.sleep(ABORT_GRACE_SECONDS)
+        self._known = self._failure(failure, failed, differing, reports)
+        raise self._known
+
+    def _is_known(self, error: BaseException | None) -> bool:
+        """Whether all ranks know of an error, or of one that it has come from."""
+        while error is not None and error is not self._known:
+            error = error.__cause__ or error.__context__
+        return error is not None
+
+    def _failure(
+        self,
+        failure: BaseException | None,
+        failed: Sequence[int],
+        differing: Sequence[int],
+        reports: Sequence[str | None],
+    ) -> BaseException:
+        """What this rank raises where one has failed, or marks differ."""
         if failure is not None:
             if self._comm is not None:
                 failure.add_note(f"on rank {self.rank} of {self.size}")
-            raise failure
+            return failure
         if failed:
-            raise ParallelError(
+            return ParallelError(
                 f"rank {failed[0]} of {self.size} has stopped the run: {reports[failed[0]]}"
             )
-        return result
+        return ParallelError(
+            f"rank {differing[0]} of {self.size} and rank 0 have computed different numbers: all "
+            "ranks must make the same call, with the same data, random_seed and software"
+        )
+
+    def share_rows(self, array: np.ndarray, parts: Sequence[tuple[int, int]]) -> None:
+        """Fill in the rows of a contiguous array that other ranks have, from first to last row."""
+        if self._comm is not None:
+            for rank, (first, last) in enumerate(parts):
+                for piece in _pieces([array[first:last]]):
+                    self._comm.Bcast(piece, rank)
 
     # Messages between two ranks
 

@@ -31,7 +31,7 @@ def cores_set_to(cores: int | None) -> Iterator[None]:
     ...     available_cores()
     3
     """
-    token = _chosen.set(cores)
+    token = _chosen.set(cores or _chosen.get())
     try:
         yield
     finally:

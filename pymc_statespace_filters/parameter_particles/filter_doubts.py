@@ -10,6 +10,7 @@ from pymc.stats.convergence import log_warnings
 from ..filter_checks.checks import kept, store
 from ..filter_checks.finding import OFF
 from ..filters.protocol import Filter
+from ..parallel.shared_rows import by_first_rank
 from ..sampling.output.filter_check import check_filters, warn_of_filters
 from .output import DoubtsOf
 from .request import Request
@@ -22,13 +23,17 @@ def checked_at_end(model: pm.Model, request: Request, *, progressbar: bool) -> D
 
     def doubts_of(tree: xr.DataTree, filter: Filter | None, seconds: float) -> Sequence[str]:
         n_particles = request.draws * request.n_populations
-        with suppress(KeyboardInterrupt):
-            rng = request.generator(_CHECK)
-            found = check_filters(tree, model, n_particles, seconds, rng, filter)
-            log_warnings(found.messages("info" if progressbar else "debug"))
-            warn_of_filters(found.warned)
-            return found.warned
-        return ()
+
+        def check() -> Sequence[str]:
+            with suppress(KeyboardInterrupt):
+                rng = request.generator(_CHECK)
+                found = check_filters(tree, model, n_particles, seconds, rng, filter)
+                log_warnings(found.messages("info" if progressbar else "debug"))
+                warn_of_filters(found.warned)
+                return found.warned
+            return ()
+
+        return by_first_rank(check)
 
     return doubts_of
 

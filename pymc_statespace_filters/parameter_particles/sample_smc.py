@@ -1,7 +1,7 @@
 """`sample_smc`: a posterior by particles of the parameters, with its evidence."""
 
 from time import perf_counter
-from typing import Literal
+from typing import Any, Literal, overload
 
 import numpy as np
 import pymc as pm
@@ -14,6 +14,7 @@ from ..evidence.posterior import Posterior, observed_in
 from ..filters.protocol import Filter
 from ..filters.recommendation import short_form
 from ..progress import stage_progress
+from ..pymc_model.in_step import Given, in_step
 from ..pymc_model.inspection import given_model
 from ..pymc_model.other_filter import model_with
 from ..pymc_model.prior import ModelFactors
@@ -29,7 +30,15 @@ from .whole_data import WholeLikelihood, tempered_run
 _MAXIMUM = 2**32 + 1  # key of random numbers beside those of the run
 
 
-def sample_smc(
+@overload
+def sample_smc(draws: int = ..., *, comm: None = ..., **settings: Any) -> xr.DataTree: ...
+
+
+@overload
+def sample_smc(draws: int = ..., *, comm: Any, **settings: Any) -> xr.DataTree | None: ...
+
+
+def sample_smc(  # type: ignore[misc]  # overloads name a few arguments
     draws: int = 1000,
     *,
     model: pm.Model | None = None,
@@ -40,7 +49,8 @@ def sample_smc(
     random_seed: int | np.random.Generator | None = None,
     progressbar: bool = True,
     compute_convergence_checks: bool = True,
-) -> xr.DataTree:
+    comm: Any = None,
+) -> xr.DataTree | None:
     r"""Draw from a posterior by sequential Monte Carlo over its parameters, with the evidence.
 
     Several populations of weighted parameters, the particles, are led from the prior to the
@@ -71,16 +81,20 @@ def sample_smc(
         Whether all states of few long chains are the particles after a move (Dau and Chopin), or
         the last states of as many short chains as there are particles.
     random_seed : int or numpy.random.Generator, optional
-        Seed, of which the result is a function, on any number of threads.
+        Seed, of which the result is a function, on any number of threads and ranks.
     progressbar : bool
         Whether to show the stage, its effective size and acceptance, after two seconds.
     compute_convergence_checks : bool
         Whether to compare filters that are not exact with unbiased ones at the end, if there are
         600 particles or more; see `check_filter`. Ctrl-C ends the comparison without an outcome.
+    comm : mpi4py.MPI.Comm, "world" or Ranks, optional
+        Ranks that evaluate the particles together, as `sample_dram` takes them; the result does not
+        depend on their number.
 
     Returns
     -------
     xarray.DataTree
+        None on ranks that do not get it.
         ``posterior`` and ``sample_stats`` (chain, draw), equally likely draws: particles of all
         populations, in proportion to weight and to the evidence that their population has found, in
         the order of their chains. A chain is nearly a population; ``sample_stats["population"]`` is
@@ -171,17 +185,23 @@ def sample_smc(
         model = model_with(model, "inner", inner)
     if not (isinstance(data, str) and data in ("tempered", "sequential")):
         raise ModelError(f"data must be 'tempered' or 'sequential', got {data!r}")
-    rng = check_random_seed(random_seed)
-    entropy = tuple(rng.integers(2**63, size=2).tolist())
-    request = checked_request(model, draws, populations, waste_free, entropy)
-    request = request._replace(inner="" if inner is None else short_form(inner))
     check_flag("progressbar", progressbar)
-    doubts_of: DoubtsOf = not_checked
-    if check_flag("compute_convergence_checks", compute_convergence_checks):
-        doubts_of = checked_at_end(model, request, progressbar=progressbar)
-    with COMPILATION:
-        run = _tempered if data == "tempered" else _sequential
-        return run(model, request, doubts_of, progressbar)
+    checks = check_flag("compute_convergence_checks", compute_convergence_checks)
+
+    def call(given: Given) -> xr.DataTree:
+        rng = check_random_seed(given.random_seed)
+        entropy = tuple(rng.integers(2**63, size=2).tolist())
+        request = checked_request(model, draws, populations, waste_free, entropy)
+        request = request._replace(inner="" if inner is None else short_form(inner))
+        shows = progressbar and given.is_first
+        doubts_of: DoubtsOf = not_checked
+        if checks:
+            doubts_of = checked_at_end(model, request, progressbar=progressbar)
+        with COMPILATION:
+            run = _tempered if data == "tempered" else _sequential
+            return run(model, request, doubts_of, shows)
+
+    return in_step(call, comm, [model], random_seed=random_seed)
 
 
 def _tempered(

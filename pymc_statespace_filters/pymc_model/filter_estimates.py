@@ -23,6 +23,7 @@ from ..filters.signatures import ONE_RECORD, PANEL
 from ..ops.base import evaluator
 from ..ops.likelihood import LogLikelihood
 from ..parallel.cpu_affinity import available_cores
+from ..parallel.shared_rows import evaluated_rows
 from .density import check_free_variables, compile_raveled
 from .inspection import scored_rows, state_space_nodes
 
@@ -122,12 +123,17 @@ class VariableAtPoints:
             return -np.inf if np.isnan(found) else found
 
         calls = [(i, seed) for i, row in zip(points, seeds, strict=True) for seed in row]
-        with ThreadPoolExecutor(min(available_cores(), max(1, len(calls)))) as pool:
-            try:
-                found = list(pool.map(lambda call: total(*call), calls))
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+        numbers = np.array(calls, dtype=np.int64).reshape(-1, 2)
+
+        def totals(part: slice) -> list[Array]:
+            with ThreadPoolExecutor(min(available_cores(), max(1, len(calls)))) as pool:
+                try:
+                    return [np.array(list(pool.map(lambda call: total(*call), calls[part])))]
+                except BaseException:
+                    pool.shutdown(cancel_futures=True)
+                    raise
+
+        (found,) = evaluated_rows(totals, [numbers], lambda m: [np.empty(m)])
         return np.reshape(found, seeds.shape)
 
 

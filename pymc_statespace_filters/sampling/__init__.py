@@ -3,7 +3,6 @@
 from .chosen_sampler import sample
 from .dram_chains import sample_dram
 from .particle_number.suggest import suggest_particles
-from .run.ranks import Ranks
 from .starts.find_starts import find_starts
 from .step import DRAM
 from .target.settings import RandomWalkSettings
@@ -11,7 +10,6 @@ from .target.settings import RandomWalkSettings
 __all__ = [
     "DRAM",
     "RandomWalkSettings",
-    "Ranks",
     "find_starts",
     "sample",
     "sample_dram",

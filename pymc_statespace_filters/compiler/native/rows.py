@@ -13,6 +13,7 @@ from pytensor.graph.replace import vectorize_graph
 from pytensor.tensor.variable import TensorVariable
 
 from ...parallel.cpu_affinity import available_cores
+from ...parallel.shared_rows import evaluated_rows
 from ...parallel.signals import held_interrupts
 from ...parallel.threads import run_in_threads
 from .entry_point import njit_cached
@@ -62,10 +63,11 @@ class Rows:
     """A function whose first ``n_varying`` arguments, float64 or int64, differ from row to row.
 
     The others are those of the function's example. Machine code runs in threads, by way of results
-    in float64. What needs Python, or is asked for ``in_turn``, as all ranks share each evaluation,
-    runs in the calling thread, one row after the other. Results depend neither on the order of the
-    rows nor on the number of threads. ``on_progress`` is called in the main thread with the number
-    of rows done since its last call.
+    in float64; ranks that share rows each evaluate a part, see `parallel.shared_rows`. What needs
+    Python, or is asked for ``in_turn``, as all ranks share each evaluation, runs in the calling
+    thread, one row after the other. Results depend neither on the order of the rows nor on the
+    number of threads and ranks. ``on_progress`` is called in the main thread with the number of
+    rows done since its last call.
     """
 
     def __init__(self, function: RowFunction, n_varying: int, *, in_turn: bool = False) -> None:
@@ -84,6 +86,24 @@ class Rows:
             np.require(column, value.dtype, ("C", "W")).reshape(m, *value.shape)
             for column, value in zip(columns, self._varying, strict=True)
         )
+        n_own = 0
+
+        def evaluate(rows: slice) -> list[np.ndarray]:
+            nonlocal n_own
+            n_own = rows.stop - rows.start
+            return self._evaluated([column[rows] for column in columns])
+
+        found = evaluated_rows(evaluate, columns, self._empty)
+        if n_own < m:
+            self.on_progress(m - n_own)
+        return found
+
+    def _empty(self, m: int) -> list[np.ndarray]:
+        return [np.empty((m, *shape), dtype) for shape, dtype in self._function.kinds]
+
+    def _evaluated(self, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """The same by this process."""
+        m = len(columns[0])
         if self._in_turn or m == 0:
             return self._one_by_one(columns, m)
         # The arguments of a row, of either type, as words of eight bytes.
@@ -97,7 +117,7 @@ class Rows:
         ]
 
     def _one_by_one(self, columns: Sequence[np.ndarray], m: int) -> list[np.ndarray]:
-        results = [np.empty((m, *shape), dtype) for shape, dtype in self._function.kinds]
+        results = self._empty(m)
         for i in range(m):
             values = self._function(*(column[i, ...] for column in columns), *self._constant)
             for result, value in zip(results, values, strict=True):

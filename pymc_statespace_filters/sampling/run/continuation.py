@@ -14,8 +14,8 @@ from pymc.model import Model
 from xarray import DataTree
 
 from ...errors import DataMismatchError, ModelError
+from ...pymc_model.fingerprint import model_data_fingerprint, model_fingerprint
 from ...pymc_model.posterior_draws import posterior_group, unconstrained_draws
-from ..checkpoint.manifest import model_data_fingerprint, model_fingerprint
 from ..kernel.state import ChainState
 from ..output.sample_stats import running_means
 from ..target.settings import RandomWalkSettings

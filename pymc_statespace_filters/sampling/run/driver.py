@@ -23,7 +23,8 @@ from pymc.stats.convergence import log_warnings
 from xarray import DataTree
 
 from ...compiler.native.compilation import COMPILATION
-from ...errors import DataMismatchError, ModelError
+from ...errors import ModelError
+from ...parallel.agreement import check_same_call
 from ...parallel.communicator import Communicator, communicator_of
 from ...parallel.cpu_affinity import allowed_cores, cores_per_process
 from ..checkpoint.checkpoint import join_checkpoint, open_checkpoint
@@ -162,7 +163,7 @@ def _check_agreement(
 ) -> None:
     """Raise, on all ranks, unless all made the same call with the same data."""
 
-    def keys() -> list[dict]:
+    def settings() -> list[dict]:
         return [
             {"models": list(models)},
             {**options.ranks.settings, "checkpoint": has_checkpoint},
@@ -172,17 +173,7 @@ def _check_agreement(
             ),
         ]
 
-    first, *others = comm.allgather(comm.run_collectively(keys))
-    for rank, theirs in enumerate(others, start=1):
-        pairs = zip(first, theirs, strict=False)  # with other numbers of models the first differ
-        differing = [name for a, b in pairs for name in a if a[name] != b[name]]
-        if differing:
-            advice = {"random_seed": _SEED_ADVICE, "pilot": _PILOT_ADVICE}
-            raise DataMismatchError(
-                f"rank {rank} of {comm.size} and rank 0 differ in "
-                f"{', '.join(dict.fromkeys(differing))}; all ranks must make the same call, with "
-                f"the same data{''.join(advice[name] for name in advice if name in differing)}"
-            )
+    check_same_call(comm, settings, {"random_seed": _SEED_ADVICE, "pilot": _PILOT_ADVICE})
 
 
 def _open_checkpoints(

@@ -15,11 +15,11 @@ from pymc.model import Model
 from pytensor.graph.basic import Variable
 
 from ...errors import ModelError
+from ...parallel.ranks import Ranks
+from ...pymc_model.fingerprint import model_data_fingerprint, model_fingerprint
 from ...system.checks import check_count, check_flag, check_positive, is_integer
-from ..checkpoint.manifest import model_data_fingerprint, model_fingerprint
 from ..target.settings import RandomWalkSettings
 from .continuation import FormerChains
-from .ranks import Ranks
 
 _MOST_ITERATIONS, _MOST_CHAINS = 10**9, 10**4  # whose arrays are too large for a memory
 _MAX_GROWTH = 20  # default of max_draws, in draws

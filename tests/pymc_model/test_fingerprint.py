@@ -15,7 +15,7 @@ from pytensor.graph.op import Op
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.sampling.checkpoint.manifest import (
+from pymc_statespace_filters.pymc_model.fingerprint import (
     model_data_fingerprint,
     model_fingerprint,
 )
@@ -188,7 +188,7 @@ def fingerprints(models):
 def test_fingerprints_agree_for_two_builds_and_in_another_process():
     here = fingerprints(MODELS)
     script = (
-        "from tests.sampling.test_fingerprint import *\n"
+        "from tests.pymc_model.test_fingerprint import *\n"
         "for name, prints in fingerprints(MODELS).items(): print(name, *prints)"
     )
     again = fingerprints(MODELS)

@@ -1,10 +1,11 @@
-"""Over which ranks of MPI chains are distributed, and how."""
+"""Over which ranks of MPI chains or rows are distributed, and how."""
 
 from dataclasses import dataclass
 from typing import Any, Self
 
-from ...errors import ModelError
-from ...system.checks import check_count
+import numpy as np
+
+from ..errors import ModelError
 
 _GATHER = ("root", "all")
 
@@ -41,7 +42,9 @@ class Ranks:
     gather: str = "root"
 
     def __post_init__(self) -> None:
-        check_count("per_chain", self.per_chain, 1)
+        number = self.per_chain
+        if not isinstance(number, int | np.integer) or isinstance(number, bool) or number < 1:
+            raise ModelError(f"per_chain must be an integer of at least 1, got {number!r}")
         if not isinstance(self.gather, str) or self.gather not in _GATHER:
             raise ModelError(f"gather must be one of {_GATHER}, got {self.gather!r}")
 

@@ -1,0 +1,31 @@
+"""Whether all ranks make the same call."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from ..errors import DataMismatchError
+from .communicator import Communicator
+
+
+def check_same_call(
+    comm: Communicator,
+    settings: Callable[[], Sequence[Mapping[str, Any]]],
+    advice: Mapping[str, str],
+) -> None:
+    """Raise, on all ranks, unless all have the same settings; ``advice`` is for some of them.
+
+    Raises
+    ------
+    DataMismatchError
+        If they differ; the message names what does.
+    """
+    first, *others = comm.allgather(comm.run_collectively(settings))
+    for rank, theirs in enumerate(others, start=1):
+        pairs = zip(first, theirs, strict=False)  # with other numbers of models the first differ
+        differing = [name for a, b in pairs for name in a if a[name] != b[name]]
+        if differing:
+            raise DataMismatchError(
+                f"rank {rank} of {comm.size} and rank 0 differ in "
+                f"{', '.join(dict.fromkeys(differing))}; all ranks must make the same call, with "
+                f"the same data{''.join(advice[name] for name in advice if name in differing)}"
+            )
