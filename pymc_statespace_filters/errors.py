@@ -4,6 +4,8 @@ A wrong argument raises an exception before anything is computed. A failure insi
 value (minus infinity and a counted reason), reported by a warning afterwards.
 """
 
+from pathlib import Path
+
 __all__ = [
     "CheckpointError",
     "CheckpointWarning",
@@ -18,6 +20,8 @@ __all__ = [
     "ParallelWarning",
     "StateSpaceFiltersError",
 ]
+
+INSIDE = (str(Path(__file__).parent),)  # files between a warning and the line of the user
 
 
 class StateSpaceFiltersError(Exception):

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pymc as pm
@@ -12,8 +13,9 @@ from numpy.typing import NDArray
 from pymc.model.fgraph import fgraph_from_model, model_from_fgraph
 from scipy.special import logsumexp
 
-from ..errors import EvidenceWarning, ModelError
+from ..errors import INSIDE, EvidenceWarning, ModelError
 from ..importance import largest_good_k, smoothed
+from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.state_graphs import StateSpaceVariable
 from ..states.draws import select_draws
@@ -24,6 +26,7 @@ from .pointwise_log_likelihood import SEQUENTIAL, sequential_terms
 Refit = Callable[[pm.Model], xr.DataTree]
 
 
+@shared_by_ranks
 def leave_future_out(
     idata: xr.DataTree,
     model: pm.Model | None = None,
@@ -32,6 +35,7 @@ def leave_future_out(
     var_name: str | None = None,
     refit: Refit | None = None,
     progressbar: bool = True,
+    comm: Any = None,
 ) -> ELPDDataLFO:
     r"""Score each observation by its predictive density given the observations before it.
 
@@ -77,6 +81,8 @@ def leave_future_out(
         ``lambda model: psf.sample_dram(1000, model=model, random_seed=1)``.
     progressbar : bool
         Whether to show how many terms are done, if they take more than two seconds.
+    comm
+        As in `filtered_states`; None with ``refit``, whose sampler takes it.
 
     Returns
     -------
@@ -127,6 +133,8 @@ def leave_future_out(
     (20, True)
     """
     model = model_of_draws(model, idata)
+    if refit is not None and comm is not None:
+        raise ModelError("comm must be None with refit, whose sampler takes it")
     variable = _one_variable(model, var_name)
     time, name = variable.dims[0], variable.name
     observed = np.flatnonzero(~np.isnan(observed_values(model, name)).all(axis=1))
@@ -202,7 +210,7 @@ def _score_by_reweighting(
     p_i = logsumexp(scored, axis=0) - np.log(len(scored)) - elpd_i
     if not known.all():
         message = _missing(known, good_k, min_observations)
-        warnings.warn(message, EvidenceWarning, stacklevel=3)
+        warnings.warn(message, EvidenceWarning, skip_file_prefixes=INSIDE)
 
     def by_time(values: NDArray[np.float64]) -> xr.DataArray:
         time = terms.dims[-1]

@@ -7,7 +7,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from ..errors import FilterWarning
+from ..errors import INSIDE, FilterWarning
 from ..filter_checks.checks import stored
 from ..filter_checks.finding import OFF
 from ..filters.outcomes import COLLAPSED
@@ -169,7 +169,7 @@ def filter_diagnostics(
         at_draws.warn_about([one.health for one in healths], [one.seeds for one in healths])
     attrs = {"predictions": PREDICTION_NOTE}
     for verdict in stored(idata, model, OFF) if filter is None else ():
-        warnings.warn(verdict, FilterWarning, stacklevel=2)
+        warnings.warn(verdict, FilterWarning, skip_file_prefixes=INSIDE)
     return add_group(idata, "filter_diagnostics", xr.merge(parts), attrs, extend_inferencedata)
 
 

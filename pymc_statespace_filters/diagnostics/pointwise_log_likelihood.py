@@ -1,10 +1,13 @@
 """Sequential log-likelihood terms at every draw, each with the noise of its own estimate."""
 
+from typing import Any
+
 import numpy as np
 import pymc as pm
 import xarray as xr
 
 from ..errors import ModelError
+from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.sequential_terms import warn_of_sequence
 from ..pymc_model.state_graphs import StateSpaceVariable, terms_of
@@ -25,6 +28,7 @@ OF_RECORDS = (
 )
 
 
+@shared_by_ranks
 def compute_log_likelihood(
     idata: xr.DataTree,
     model: pm.Model | None = None,
@@ -32,6 +36,7 @@ def compute_log_likelihood(
     var_name: str | None = None,
     extend_inferencedata: bool = True,
     progressbar: bool = True,
+    comm: Any = None,
 ) -> xr.DataTree:
     r"""Evaluate the log-likelihood terms at every draw, with the draw's own noise.
 
@@ -55,7 +60,7 @@ def compute_log_likelihood(
     ----------
     idata : xarray.DataTree
         Posterior draws. If ``sample_stats`` holds no seeds, the seed of the model is used.
-    model, var_name, progressbar
+    model, var_name, progressbar, comm
         As in `filtered_states`.
     extend_inferencedata : bool
         Whether to add the terms to the group of `idata`, beside those of other variables; otherwise

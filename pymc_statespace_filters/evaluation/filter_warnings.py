@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..compiler.lowering.compiled_system import compile_system
-from ..errors import FilterWarning
+from ..errors import INSIDE, FilterWarning
 from ..filters.outcomes import COLLAPSED, Failure
 from ..filters.protocol import HealthFilter
 from ..filters.recommendation import (
@@ -39,7 +39,6 @@ def warn_about(
     arguments_of: Callable[[int], Arguments],
     *,
     labels: Sequence[Any] | None = None,
-    stacklevel: int = 3,
 ) -> None:
     """Warn once of failures and once of collapse in some evaluations, given their health (n, 3).
 
@@ -60,7 +59,7 @@ def warn_about(
             f"{short_form(filter)} gave -inf{share}{of_records}{place}: {failure.message}",
             *_cures(system, filter, failure, arguments),
         )
-        warnings.warn(f"{'. '.join(sentences)}.", FilterWarning, stacklevel=stacklevel)
+        warnings.warn(f"{'. '.join(sentences)}.", FilterWarning, skip_file_prefixes=INSIDE)
     smallest = np.where(failed, np.inf, health[:, 0])
     collapsed = smallest < COLLAPSED
     worst = int(np.argmin(smallest))
@@ -75,7 +74,7 @@ def warn_about(
             extent,
             collapse_remedy(compile_system(system), filter),
         )
-        warnings.warn(". ".join(sentences), FilterWarning, stacklevel=stacklevel)
+        warnings.warn(". ".join(sentences), FilterWarning, skip_file_prefixes=INSIDE)
 
 
 def _about_copies(system: StateSpaceModel, filter: Any) -> list[str]:
@@ -150,12 +149,12 @@ def _named(labels: Sequence[Any] | None, of_each: Any, chosen: np.ndarray) -> st
     return f", of {'record' if len(found) == 1 else 'records'} {listed}"
 
 
-def warn_of_choice(system: StateSpaceModel, filter: Any, *, stacklevel: int = 3) -> None:
+def warn_of_choice(system: StateSpaceModel, filter: Any) -> None:
     """Warn if the filter linearises an equation that jumps, or repeats a run without noise."""
     compiled = compile_system(system)
     for problem in (jump_problem(compiled, filter), repetition_problem(compiled, filter)):
         if problem is not None:
-            warnings.warn(problem, FilterWarning, stacklevel=stacklevel)
+            warnings.warn(problem, FilterWarning, skip_file_prefixes=INSIDE)
 
 
 def _extent(system: StateSpaceModel, filter: Any, arguments: Arguments) -> str | None:

@@ -188,7 +188,7 @@ def _warn_of_records(
     arguments = [(own, *record, own_seed) for own, record, own_seed in parts]
     health = np.array([evaluate(*each)[1] for each in arguments])
     labels = table.records.labels
-    warn_about(system, filter, health, lambda g: arguments[g], labels=labels, stacklevel=5)
+    warn_about(system, filter, health, lambda g: arguments[g], labels=labels)
 
 
 def _check_agreement(ranks: Communicator, filter: Filter, arrays: Sequence[np.ndarray]) -> None:

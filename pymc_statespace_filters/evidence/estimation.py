@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import is_dataclass, replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -10,9 +11,10 @@ import pymc as pm
 import xarray as xr
 
 from ..compiler.native.compilation import COMPILATION
-from ..errors import EvidenceWarning, ModelError
+from ..errors import INSIDE, EvidenceWarning, ModelError
 from ..filters.protocol import Filter
 from ..parallel.cpu_affinity import cores_set_to
+from ..pymc_model.in_step import shared_by_ranks
 from ..system.checks import check_count, check_positive
 from .agreement import Agreement, assess_agreement
 from .estimators.bridge import Bridge
@@ -38,6 +40,7 @@ DEFAULT = ("chib_jeliazkov", "bridge")
 ESTIMATORS: Mapping[str, Estimator] = {estimator.name: estimator for estimator in _BUILT_IN}
 
 
+@shared_by_ranks
 def chib_jeliazkov(
     idata: xr.DataTree,
     model: pm.Model | None = None,
@@ -48,6 +51,7 @@ def chib_jeliazkov(
     extend_inferencedata: bool = True,
     progressbar: bool = True,
     cores: int | None = None,
+    comm: Any = None,
 ) -> Evidence:
     """Estimate the evidence of a model from draws of its posterior (thesis, 3.3.2 and Eq. 3.44).
 
@@ -78,10 +82,14 @@ def chib_jeliazkov(
     cores : int, optional
         Number of threads, on which no number depends; by default one for each core that the process
         may use.
+    comm : mpi4py.MPI.Comm, "world" or Ranks, optional
+        Ranks among which the points are divided, as in `sample_dram`; the result does not depend
+        on their number. A rank whose ``idata`` is None gets that of the first.
 
     Returns
     -------
     Evidence
+        None on ranks that do not get it.
         Its `se` accounts for the autocorrelation of the draws and the error of the proposals. If
         the chains held one noise seed (``noise="held"``), this is the evidence under that seed, and
         `se` excludes the error of the filter.
@@ -175,6 +183,7 @@ class EvidenceEstimates(dict[str, Evidence]):
         return f"the estimates disagree: {self.agreement.diagnosis}"
 
 
+@shared_by_ranks
 def estimate_evidence(
     idata: xr.DataTree,
     model: pm.Model | None = None,
@@ -186,6 +195,7 @@ def estimate_evidence(
     extend_inferencedata: bool = True,
     progressbar: bool = True,
     cores: int | None = None,
+    comm: Any = None,
 ) -> EvidenceEstimates:
     """Estimate the evidence of a model by several estimators and test whether they agree.
 
@@ -225,10 +235,14 @@ def estimate_evidence(
     cores : int, optional
         Number of threads, on which no number depends; by default one for each core that the process
         may use.
+    comm : mpi4py.MPI.Comm, "world" or Ranks, optional
+        Ranks among which the points are divided, as in `sample_dram`; the result does not depend
+        on their number. A rank whose ``idata`` is None gets that of the first.
 
     Returns
     -------
     EvidenceEstimates
+        None on ranks that do not get it.
         A dictionary of name to `Evidence`, displayed as a table. Its ``agreement`` is true if the
         estimates agree and has the attributes ``p_value``, ``difference`` (nats) and ``diagnosis``
         (the likely cause of a disagreement). ``to_dataframe()`` returns the table.
@@ -303,7 +317,7 @@ def estimate_evidence(
         warnings.warn(
             f"the estimates of the log-evidence disagree: {found.agreement.diagnosis}",
             EvidenceWarning,
-            stacklevel=2,
+            skip_file_prefixes=INSIDE,
         )
     return found
 

@@ -12,10 +12,11 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
-from ..errors import EvidenceWarning, ModelError
+from ..errors import INSIDE, EvidenceWarning, ModelError
 from ..filter_checks.checks import stored as stored_filter_checks
 from ..filter_checks.finding import OFF
 from ..filters.protocol import Filter
+from ..parallel.shared_rows import by_first_rank
 from ..progress import row_progress
 from ..pymc_model.density import ModelDensity
 from ..pymc_model.inspection import exactness
@@ -131,7 +132,7 @@ def _missed(
     if posterior.log_density.size < LEAST_DRAWS:
         return []
     parts = posterior.draws, posterior.log_density, posterior.evaluate
-    return unvisited(model, *parts, CHECK_SECONDS, rng)
+    return by_first_rank(lambda: unvisited(model, *parts, CHECK_SECONDS, rng))
 
 
 def _where_reached(
@@ -202,4 +203,6 @@ def _estimates(
 
 def _warn(message: str, reasons: Sequence[str]) -> None:
     if reasons:
-        warnings.warn(f"{message}: {'; '.join(reasons)}", EvidenceWarning, stacklevel=4)
+        warnings.warn(
+            f"{message}: {'; '.join(reasons)}", EvidenceWarning, skip_file_prefixes=INSIDE
+        )

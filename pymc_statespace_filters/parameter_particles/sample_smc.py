@@ -1,7 +1,7 @@
 """`sample_smc`: a posterior by particles of the parameters, with its evidence."""
 
 from time import perf_counter
-from typing import Any, Literal, overload
+from typing import Any, Literal
 
 import numpy as np
 import pymc as pm
@@ -14,7 +14,7 @@ from ..evidence.posterior import Posterior, observed_in
 from ..filters.protocol import Filter
 from ..filters.recommendation import short_form
 from ..progress import stage_progress
-from ..pymc_model.in_step import Given, in_step
+from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.inspection import given_model
 from ..pymc_model.other_filter import model_with
 from ..pymc_model.prior import ModelFactors
@@ -30,15 +30,8 @@ from .whole_data import WholeLikelihood, tempered_run
 _MAXIMUM = 2**32 + 1  # key of random numbers beside those of the run
 
 
-@overload
-def sample_smc(draws: int = ..., *, comm: None = ..., **settings: Any) -> xr.DataTree: ...
-
-
-@overload
-def sample_smc(draws: int = ..., *, comm: Any, **settings: Any) -> xr.DataTree | None: ...
-
-
-def sample_smc(  # type: ignore[misc]  # overloads name a few arguments
+@shared_by_ranks
+def sample_smc(
     draws: int = 1000,
     *,
     model: pm.Model | None = None,
@@ -50,7 +43,7 @@ def sample_smc(  # type: ignore[misc]  # overloads name a few arguments
     progressbar: bool = True,
     compute_convergence_checks: bool = True,
     comm: Any = None,
-) -> xr.DataTree | None:
+) -> xr.DataTree:
     r"""Draw from a posterior by sequential Monte Carlo over its parameters, with the evidence.
 
     Several populations of weighted parameters, the particles, are led from the prior to the
@@ -185,23 +178,17 @@ def sample_smc(  # type: ignore[misc]  # overloads name a few arguments
         model = model_with(model, "inner", inner)
     if not (isinstance(data, str) and data in ("tempered", "sequential")):
         raise ModelError(f"data must be 'tempered' or 'sequential', got {data!r}")
+    rng = check_random_seed(random_seed)
+    entropy = tuple(rng.integers(2**63, size=2).tolist())
+    request = checked_request(model, draws, populations, waste_free, entropy)
+    request = request._replace(inner="" if inner is None else short_form(inner))
     check_flag("progressbar", progressbar)
-    checks = check_flag("compute_convergence_checks", compute_convergence_checks)
-
-    def call(given: Given) -> xr.DataTree:
-        rng = check_random_seed(given.random_seed)
-        entropy = tuple(rng.integers(2**63, size=2).tolist())
-        request = checked_request(model, draws, populations, waste_free, entropy)
-        request = request._replace(inner="" if inner is None else short_form(inner))
-        shows = progressbar and given.is_first
-        doubts_of: DoubtsOf = not_checked
-        if checks:
-            doubts_of = checked_at_end(model, request, progressbar=progressbar)
-        with COMPILATION:
-            run = _tempered if data == "tempered" else _sequential
-            return run(model, request, doubts_of, shows)
-
-    return in_step(call, comm, [model], random_seed=random_seed)
+    doubts_of: DoubtsOf = not_checked
+    if check_flag("compute_convergence_checks", compute_convergence_checks):
+        doubts_of = checked_at_end(model, request, progressbar=progressbar)
+    with COMPILATION:
+        run = _tempered if data == "tempered" else _sequential
+        return run(model, request, doubts_of, progressbar)
 
 
 def _tempered(

@@ -14,6 +14,7 @@ from types import FrameType
 import pymc
 import pytensor
 
+from ..errors import INSIDE as PACKAGE
 from ..errors import FilterWarning
 from ..filters.protocol import Filter
 from ..filters.recommendation import short_form
@@ -24,7 +25,7 @@ WITH_GRADIENT = ("pymc.step_methods.hmc.", "pymc.step_methods.arraystep.")
 _GRAPHS = ("pymc.logprob.", "pymc.model.", "pytensor.", "functools", f"{__package__}.")
 # Files between a warning and the line of the user.
 INSIDE = (
-    str(Path(__file__).parents[1]),
+    *PACKAGE,
     *(str(Path(module.__file__).parent) for module in (pymc, pytensor)),
     functools.__file__.removesuffix(".py"),
 )

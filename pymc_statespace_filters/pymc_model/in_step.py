@@ -2,9 +2,11 @@
 
 import logging
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from functools import wraps
+from inspect import BoundArguments, signature
+from typing import Any, cast
 
 import numpy as np
 import pymc as pm
@@ -16,6 +18,7 @@ from ..parallel.cpu_affinity import allowed_cores, cores_per_process, cores_set_
 from ..parallel.ranks import Ranks
 from ..parallel.shared_rows import rows_shared_by
 from .fingerprint import model_data_fingerprint, model_fingerprint
+from .inspection import given_model
 
 _SEED_ADVICE = (
     ", and the same integer as random_seed: a Generator is the same on two ranks only if both were "
@@ -23,69 +26,63 @@ _SEED_ADVICE = (
 )
 
 
-class Given(NamedTuple):
-    """What one rank of a call works with."""
+def shared_by_ranks[**P, R](function: Callable[P, R]) -> Callable[P, R]:
+    """Let the ranks of a function's argument ``comm`` share the points that it evaluates.
 
-    idata: Any  # that of the first rank, where this one has none
-    random_seed: Any  # the same on all ranks
-    is_first: bool  # whether this rank shows bars
-
-
-def in_step[R](
-    call: Callable[[Given], R],
-    comm: Any,
-    models: Sequence[pm.Model],
-    *,
-    idata: Any = None,
-    random_seed: Any = None,
-) -> R | None:
-    """Make a call on all ranks of ``comm``; None on those that do not get its result.
-
-    The points at which its functions are evaluated are divided among the ranks. Only the first one
-    warns and logs.
+    The function has an argument ``model``, and of ``idata``, ``random_seed`` and ``progressbar``
+    those that it needs. All ranks make the call in step: those without draws get them from the
+    first rank, which alone shows bars, warns and logs. The result is None, beside its type, on
+    ranks that do not get it.
 
     Raises
     ------
     ModelError
-        If ``comm`` is invalid.
+        By the function, if ``comm`` is invalid.
     DataMismatchError
         If models, their data or seeds of the ranks differ.
     ParallelError
         If another rank has failed, or MPI cannot be used.
     """
-    ranks = Ranks.of(comm)
-    if ranks.per_chain != 1:
-        raise ModelError(f"per_chain of Ranks must be 1 without chains, got {ranks.per_chain}")
-    with communicator_of(ranks.comm) as communicator:
-        if communicator.size == 1:
-            return call(Given(idata, random_seed, True))
-        is_first = communicator.rank == 0
-        given = _given(communicator, ranks, models, idata, random_seed)
-        with _quiet(not is_first), _own_cores(communicator), rows_shared_by(communicator):
-            result: R | None = communicator.run_collectively(lambda: call(given))
-        if ranks.gather == "all":
-            return communicator.broadcast(result)
-        return result if is_first else None
+    own = signature(function)
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        if kwargs.get("comm") is None:
+            return function(*args, **kwargs)
+        given = own.bind(*args, **kwargs)
+        ranks = Ranks.of(kwargs["comm"])
+        if ranks.per_chain != 1:
+            raise ModelError(f"per_chain of Ranks must be 1 without chains, got {ranks.per_chain}")
+        with communicator_of(ranks.comm) as comm:
+            if comm.size == 1:
+                return function(*args, **kwargs)
+            _share_arguments(comm, ranks, given)
+            is_first = comm.rank == 0
+            with _quiet(not is_first), _own_cores(comm), rows_shared_by(comm):
+                result = comm.run_collectively(lambda: function(*given.args, **given.kwargs))
+            if ranks.gather == "all":
+                return comm.broadcast(result)
+            return result if is_first else cast(R, None)
+
+    return call
 
 
-def _given(
-    comm: Communicator, ranks: Ranks, models: Sequence[pm.Model], idata: Any, random_seed: Any
-) -> Given:
-    """The arguments of this rank, which are checked to be those of all."""
+def _share_arguments(comm: Communicator, ranks: Ranks, given: BoundArguments) -> None:
+    """Check that all ranks have the same arguments, and complete those of this one."""
+    given.apply_defaults()
+    values = given.arguments
+    values["model"] = given_model(values["model"])
+    settings = ranks.settings | {"random_seed": _comparable(values.get("random_seed"))}
     check_same_call(
-        comm,
-        lambda: [
-            ranks.settings | {"random_seed": _comparable(random_seed)},
-            *map(_identity, models),
-        ],
-        {"random_seed": _SEED_ADVICE},
+        comm, lambda: [settings, _identity(values["model"])], {"random_seed": _SEED_ADVICE}
     )
-    if random_seed is None:
-        random_seed = comm.broadcast(int(np.random.default_rng().integers(2**63)))
-    if not all(comm.allgather(idata is not None)):
-        first = comm.broadcast(idata)
-        idata = first if idata is None else idata
-    return Given(idata, random_seed, comm.rank == 0)
+    if "random_seed" in values and values["random_seed"] is None:
+        values["random_seed"] = comm.broadcast(int(np.random.default_rng().integers(2**63)))
+    if "idata" in values and not all(comm.allgather(values["idata"] is not None)):
+        first = comm.broadcast(values["idata"])
+        values["idata"] = first if values["idata"] is None else values["idata"]
+    if comm.rank > 0:
+        values["progressbar"] = False
 
 
 def _comparable(random_seed: Any) -> Any:

@@ -6,6 +6,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
+from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.state_graphs import observed_variables, smoothing_method
 from ..system.checks import check_random_seed
@@ -16,6 +17,7 @@ from .groups import add_group, coords_of_steps, join_rows, state_dims
 from .variable import VariableAtDraws, select_variables
 
 
+@shared_by_ranks
 def filtered_states(
     idata: xr.DataTree,
     model: pm.Model | None = None,
@@ -27,6 +29,7 @@ def filtered_states(
     random_seed: int | np.random.Generator | None = None,
     extend_inferencedata: bool = True,
     progressbar: bool = True,
+    comm: Any = None,
 ) -> xr.DataTree:
     """Estimate states given the observations up to their time, at draws of the posterior.
 
@@ -51,10 +54,14 @@ def filtered_states(
         Whether to add the group to `idata`; otherwise it is returned in a new DataTree.
     progressbar : bool
         Whether to show a progress bar if the work takes more than two seconds.
+    comm : mpi4py.MPI.Comm, "world" or Ranks, optional
+        Ranks among which the draws are divided, as in `sample_dram`; the result does not depend
+        on their number. A rank whose ``idata`` is None gets that of the first.
 
     Returns
     -------
     xarray.DataTree
+        None on ranks that do not get it.
         With the group ``filtered_states``. For a variable "d": ``d_mean`` and ``d_sd``, mean and
         standard deviation of the state given the parameters of the draw; ``d_states``, one state
         drawn from that distribution, so that all draws together follow the posterior distribution
@@ -107,6 +114,7 @@ def filtered_states(
     )  # fmt: skip
 
 
+@shared_by_ranks
 def smoothed_states(
     idata: xr.DataTree,
     model: pm.Model | None = None,
@@ -118,6 +126,7 @@ def smoothed_states(
     random_seed: int | np.random.Generator | None = None,
     extend_inferencedata: bool = True,
     progressbar: bool = True,
+    comm: Any = None,
 ) -> xr.DataTree:
     """Estimate states given all observations, at draws of the posterior.
 
@@ -205,7 +214,5 @@ def _add_states(
         if moment == "smoothed":
             part[f"{name}_states"].attrs["smoothing"] = smoothing_method(variable)
         parts.append(part)
-        at_draws.warn_about(
-            [one.health for one in states], [one.seeds for one in states], stacklevel=5
-        )
+        at_draws.warn_about([one.health for one in states], [one.seeds for one in states])
     return add_group(idata, f"{moment}_states", xr.merge(parts), {"at": at}, extend_inferencedata)

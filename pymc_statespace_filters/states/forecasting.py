@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ..compiler.native.python_call import call_machine_code
 from ..errors import ModelError
 from ..evaluation.simulate import continuation
+from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.state_graphs import observed_variables
 from ..system.checks import check_random_seed, is_integer
@@ -26,6 +27,7 @@ from .record import Array, RecordAtDraws
 from .variable import VariableAtDraws, select_variables
 
 
+@shared_by_ranks
 def forecast(
     idata: xr.DataTree,
     model: pm.Model | None = None,
@@ -42,6 +44,7 @@ def forecast(
     random_seed: int | np.random.Generator | None = None,
     extend_inferencedata: bool = True,
     progressbar: bool = True,
+    comm: Any = None,
 ) -> xr.DataTree:
     """Predict states and observations after the last observation, at draws of the posterior.
 
@@ -50,7 +53,7 @@ def forecast(
 
     Parameters
     ----------
-    idata, model, var_name, filter, n_draws, random_seed, extend_inferencedata, progressbar
+    idata, model, var_name, filter, n_draws, random_seed, extend_inferencedata, progressbar, comm
         As in `filtered_states`.
     n_steps : int, optional
         Number of steps after the last observation. Give exactly one of `n_steps`, `steps`, `times`.

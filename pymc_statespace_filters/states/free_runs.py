@@ -12,7 +12,7 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
-from ..errors import FilterWarning, ModelError
+from ..errors import INSIDE, FilterWarning, ModelError
 from ..evaluation.simulate import simulator
 from ..parallel.cpu_affinity import available_cores
 from ..parallel.threads import run_in_threads
@@ -344,7 +344,7 @@ def _warn_of_failed_runs(name: str, paths: Sequence[Array]) -> None:
             f"{failed.size} {runs}, where the model is unstable: their predictions are NaN, and no "
             "error or coverage counts them",
             FilterWarning,
-            stacklevel=3,
+            skip_file_prefixes=INSIDE,
         )
 
 

@@ -141,13 +141,7 @@ class VariableAtDraws:
             return None
         return self._call(function, [seeds, *drawn], [*_which(record), *constant])
 
-    def warn_about(
-        self,
-        health: Sequence[Array],
-        seeds: Sequence[NDArray[np.int64]],
-        *,
-        stacklevel: int = 4,
-    ) -> None:
+    def warn_about(self, health: Sequence[Array], seeds: Sequence[NDArray[np.int64]]) -> None:
         """Warn of failures and of collapse, given health (draws, 3) and seeds of every record.
 
         Raises
@@ -167,7 +161,6 @@ class VariableAtDraws:
             np.concatenate(health),
             arguments_of,
             labels=[one.label for one in self.records] if self.variable.is_panel else None,
-            stacklevel=stacklevel,
         )
 
     def _check_seeds(self, failed: NDArray[np.bool_]) -> None:

@@ -11,13 +11,14 @@ import pymc as pm
 import xarray as xr
 
 from ...compiler.native.compilation import COMPILATION
-from ...errors import EvidenceWarning, ModelError
+from ...errors import INSIDE, EvidenceWarning, ModelError
 from ...filters.protocol import Filter
 from ...filters.recommendation import short_form
 from ...importance import MIN_EFFECTIVE, largest_good_k, pareto_k
 from ...parallel.cpu_affinity import cores_set_to
 from ...progress import row_progress
 from ...pymc_model.density import ModelDensity
+from ...pymc_model.in_step import shared_by_ranks
 from ...pymc_model.other_filter import model_of_draws
 from ...pymc_model.posterior_draws import MIN_DRAWS, noise_was_moved, posterior_group
 from ...system.checks import check_count, check_random_seed, is_integer
@@ -32,6 +33,7 @@ MAX_SPREAD, LEAST_LEFT = 2.0, 0.2
 MAX_BEYOND = 0.05  # share of the posterior where there are no draws
 
 
+@shared_by_ranks
 def reweight(
     idata: xr.DataTree,
     model: pm.Model | None = None,
@@ -41,6 +43,7 @@ def reweight(
     random_seed: int | np.random.Generator | None = None,
     progressbar: bool = True,
     cores: int | None = None,
+    comm: Any = None,
 ) -> xr.DataTree:
     r"""Correct draws of an approximate posterior by an unbiased filter.
 
@@ -70,10 +73,15 @@ def reweight(
     cores : int, optional
         Number of threads, on which no number depends; by default one for each core that the process
         may use.
+    comm : mpi4py.MPI.Comm, "world" or Ranks, optional
+        Ranks among which the points are divided, as in `sample_dram`; the result does not depend
+        on their number. A rank whose ``idata`` is None gets that of the first.
 
     Returns
     -------
     xarray.DataTree
+        None on ranks that do not get it.
+
         ``posterior`` : draws of the exact posterior, resampled by the weights, with equal weights
         now; variables of the model. ``sample_stats`` : as of a chain with the new filter, the
         log-density ``lp`` and the noise seed ``NAME_seed`` of every draw, so that states and
@@ -174,7 +182,7 @@ def reweight(
     attrs = _attributes(found, exact)
     tree.attrs |= attrs
     for problem in _problems(attrs, filter):
-        warnings.warn(problem, EvidenceWarning, stacklevel=2)
+        warnings.warn(problem, EvidenceWarning, skip_file_prefixes=INSIDE)
     return tree
 
 
