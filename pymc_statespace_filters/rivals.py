@@ -119,9 +119,8 @@ def run_models(
     if sampler == "smc":
         if pilot is not None:
             raise ModelError("pilot must be None with sampler='smc', which starts from the prior")
-        if checkpoint is not None:
-            raise ModelError("checkpoint must be None with sampler='smc'")
-        return _particles(models, settings, comm)
+        stored_in = dict(zip(models, folders, strict=False))
+        return _particles(models, settings, stored_in, comm)
     given = RunArguments(**settings)
     requests = warm_started_models(given.request(), models, pilot)
     return sample_models(models, requests, given.options(comm), folders)
@@ -141,7 +140,7 @@ def _check_models(models: Mapping[str, Model]) -> None:
 
 
 def _particles(
-    models: Mapping[str, Model], settings: Mapping[str, Any], comm: Any
+    models: Mapping[str, Model], settings: Mapping[str, Any], folders: Mapping[str, Path], comm: Any
 ) -> dict[str, DataTree] | None:
     """Every model by `sample_smc`, with the same seed; None on ranks that do not get them."""
     seed, found = settings.get("random_seed"), {}
@@ -149,7 +148,8 @@ def _particles(
         # Each gets the numbers that a generator would give the first.
         own = deepcopy(seed) if isinstance(seed, np.random.Generator) else seed
         try:
-            tree = sample_smc(model=model, comm=comm, **{**settings, "random_seed": own})
+            own_settings = {**settings, "random_seed": own, "checkpoint": folders.get(name)}
+            tree = sample_smc(model=model, comm=comm, **own_settings)
         except Exception as error:
             error.add_note(f"in model {name!r}")
             raise

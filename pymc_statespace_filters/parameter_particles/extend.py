@@ -21,6 +21,7 @@ from .filter_doubts import kept_from
 from .observed_rows import ObservedRows
 from .sequential_output import finished
 from .stored_run import restored
+from .stored_steps import StoredSteps
 
 
 def extend(
@@ -121,7 +122,7 @@ def extend(
         request = request._replace(entropy=tuple(entropy))
     progress = progress._replace(rows=rows.with_record(record))
     with COMPILATION:
-        return finished(progress, request, kept_from(idata), progressbar=progressbar)
+        return finished(progress, request, kept_from(idata), StoredSteps(), progressbar=progressbar)
 
 
 def _new_rows(

@@ -1,6 +1,8 @@
 """The arguments of a run, checked, and what all runs have in common."""
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from importlib.metadata import version
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import pymc as pm
@@ -11,6 +13,8 @@ from ..errors import ModelError
 from ..filters.outcomes import why_zero
 from ..pymc_model.density import check_free_variables
 from ..pymc_model.filter_estimates import failures_at
+from ..pymc_model.fingerprint import FINGERPRINT_DIGITS, model_data_fingerprint, model_fingerprint
+from ..pymc_model.other_filter import BY_PARTICLES
 from ..smc.bridge import Cloud
 from ..smc.moves import Size
 from ..smc.particles import Particles, Populations
@@ -32,6 +36,36 @@ class Request(NamedTuple):
     def n_particles(self) -> int:
         """Particles of all populations, the pilot included."""
         return self.size.n_particles * (1 + self.n_populations)
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What a step that is stored has to bring along: the key."""
+        return {"entropy": np.array(self.entropy)}
+
+    def going_on(self, arrays: Mapping[str, np.ndarray]) -> Self:
+        """With the key of a step that was stored, if there is one."""
+        return self._replace(entropy=tuple(arrays["entropy"].tolist())) if arrays else self
+
+    def settings(self, model: pm.Model, data: str, *, is_seeded: bool) -> dict[str, Any]:
+        """All that a run depends on, as values of JSON.
+
+        Raises
+        ------
+        ModelError
+            If a part of the model has no text that is the same in every process.
+        """
+        return {
+            "sampler": BY_PARTICLES,
+            "data": data,
+            "draws": self.draws,
+            "populations": self.n_populations,
+            "waste_free": self.size.waste_free,
+            "inner": self.inner,
+            "random_seed": list(self.entropy) if is_seeded else None,
+            "model": model_fingerprint(model)[:FINGERPRINT_DIGITS],
+            "observed and other data": model_data_fingerprint(model)[:FINGERPRINT_DIGITS],
+            "version": version("pymc-statespace-filters"),
+        }
 
     def generator(self, *key: int) -> np.random.Generator:
         """The random numbers of a part of the run."""

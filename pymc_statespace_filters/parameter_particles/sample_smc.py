@@ -1,5 +1,6 @@
 """`sample_smc`: a posterior by particles of the parameters, with its evidence."""
 
+import os
 from time import perf_counter
 from typing import Any, Literal
 
@@ -13,6 +14,7 @@ from ..evidence.estimators.maximum_likelihood import max_log_likelihood
 from ..evidence.posterior import Posterior, observed_in
 from ..filters.protocol import Filter
 from ..filters.recommendation import short_form
+from ..parallel.shared_rows import by_first_rank
 from ..progress import stage_progress
 from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.inspection import given_model
@@ -25,6 +27,8 @@ from .output import DoubtsOf, as_datatree
 from .request import Request, Run, checked_request
 from .sequential_output import finished
 from .sequential_run import Progress
+from .stored_run import progress_of_arrays
+from .stored_steps import StoredSteps, steps_stored_in
 from .whole_data import WholeLikelihood, tempered_run
 
 _MAXIMUM = 2**32 + 1  # key of random numbers beside those of the run
@@ -42,6 +46,7 @@ def sample_smc(
     random_seed: int | np.random.Generator | None = None,
     progressbar: bool = True,
     compute_convergence_checks: bool = True,
+    checkpoint: str | os.PathLike | None = None,
     comm: Any = None,
 ) -> xr.DataTree:
     r"""Draw from a posterior by sequential Monte Carlo over its parameters, with the evidence.
@@ -80,6 +85,11 @@ def sample_smc(
     compute_convergence_checks : bool
         Whether to compare filters that are not exact with unbiased ones at the end, if there are
         600 particles or more; see `check_filter`. Ctrl-C ends the comparison without an outcome.
+    checkpoint : str or path, optional
+        A folder in which the particles are stored every few seconds, after a stage of "tempered" or
+        a row of "sequential". If the process ends for any reason, the same call goes on from there,
+        on any number of ranks, to the same result. It is refused for another model, other data or
+        other arguments.
     comm : mpi4py.MPI.Comm, "world" or Ranks, optional
         Ranks that evaluate the particles together, as `sample_dram` takes them; the result does not
         depend on their number.
@@ -113,6 +123,13 @@ def sample_smc(
         If an argument is invalid, a free variable is discrete, the prior cannot be drawn from, the
         likelihood is zero at nearly all its draws, or the data of "sequential" do not come row by
         row: several variables, a panel, a Potential, a `GuidedPF` or `GridFilter`.
+
+    DataMismatchError
+        If the checkpoint is of another run, or the ranks differ; the message says in what.
+    ParallelError
+        If another rank has failed, or MPI cannot be used.
+    CheckpointError
+        If a file of the checkpoint cannot be written or read.
 
     Warns
     -----
@@ -179,24 +196,36 @@ def sample_smc(
     if not (isinstance(data, str) and data in ("tempered", "sequential")):
         raise ModelError(f"data must be 'tempered' or 'sequential', got {data!r}")
     rng = check_random_seed(random_seed)
-    entropy = tuple(rng.integers(2**63, size=2).tolist())
+    entropy = by_first_rank(lambda: tuple(rng.integers(2**63, size=2).tolist()))
     request = checked_request(model, draws, populations, waste_free, entropy)
     request = request._replace(inner="" if inner is None else short_form(inner))
     check_flag("progressbar", progressbar)
-    doubts_of: DoubtsOf = not_checked
-    if check_flag("compute_convergence_checks", compute_convergence_checks):
-        doubts_of = checked_at_end(model, request, progressbar=progressbar)
-    with COMPILATION:
+    checks = check_flag("compute_convergence_checks", compute_convergence_checks)
+    is_seeded = random_seed is not None
+    with (
+        COMPILATION,
+        steps_stored_in(
+            checkpoint, lambda: request.settings(model, data, is_seeded=is_seeded)
+        ) as steps,
+    ):
+        own = request.going_on(steps.found)
+        doubts_of: DoubtsOf = not_checked
+        if checks:
+            doubts_of = checked_at_end(model, own, progressbar=progressbar)
         run = _tempered if data == "tempered" else _sequential
-        return run(model, request, doubts_of, progressbar)
+        return run(model, own, doubts_of, steps, progressbar)
 
 
 def _tempered(
-    model: pm.Model, request: Request, doubts_of: DoubtsOf, progressbar: bool
+    model: pm.Model,
+    request: Request,
+    doubts_of: DoubtsOf,
+    steps: StoredSteps,
+    progressbar: bool,
 ) -> xr.DataTree:
     began, likelihood = perf_counter(), WholeLikelihood(model)
     with stage_progress(1.0, enabled=progressbar) as show:
-        run = tempered_run(model, likelihood, request, show)
+        run = tempered_run(model, likelihood, request, show, steps)
         maximum = _maximum(likelihood.factors, run, request)
     seconds = perf_counter() - began
     observed = observed_in(model)
@@ -207,10 +236,18 @@ def _tempered(
 
 
 def _sequential(
-    model: pm.Model, request: Request, doubts_of: DoubtsOf, progressbar: bool
+    model: pm.Model,
+    request: Request,
+    doubts_of: DoubtsOf,
+    steps: StoredSteps,
+    progressbar: bool,
 ) -> xr.DataTree:
-    begin = Progress.before_any_row(ObservedRows.of(model), request)
-    return finished(begin, request, doubts_of, progressbar=progressbar)
+    rows = ObservedRows.of(model)
+    if steps.found:
+        begin = progress_of_arrays(steps.found, rows)
+    else:
+        begin = Progress.before_any_row(rows, request)
+    return finished(begin, request, doubts_of, steps, progressbar=progressbar)
 
 
 def _maximum(factors: ModelFactors, run: Run, request: Request) -> float:

@@ -13,16 +13,29 @@ from .observed_rows import ObservedRows
 from .output import COURSE, DoubtsOf, as_datatree
 from .request import Request
 from .sequential_run import Progress, advance
-from .stored_run import GROUP, stored
+from .stored_run import GROUP, arrays_of_progress, stored
+from .stored_steps import StoredSteps
 
 
 def finished(
-    progress: Progress, request: Request, doubts_of: DoubtsOf, *, progressbar: bool
+    progress: Progress,
+    request: Request,
+    doubts_of: DoubtsOf,
+    steps: StoredSteps,
+    *,
+    progressbar: bool,
 ) -> xr.DataTree:
     """The result of a run that is led through all rows of its record."""
+
+    def on_row(now: Progress) -> None:
+        is_last = now.n_rows == n_rows
+        steps.save(lambda: arrays_of_progress(now) | request.arrays, is_last=is_last)
+        sizes = f"effective size {now.courses[-1].effective_size.mean():.0f}"
+        show(now.n_rows, f"observation {now.n_rows}, {sizes}")
+
     began, n_rows = perf_counter(), len(progress.rows.record.steps)
     with stage_progress(n_rows, enabled=progressbar) as show:
-        progress = advance(progress, request, show)
+        progress = advance(progress, request, on_row)
     rows, run = progress.rows, progress.as_run()
     likelihood = run.cloud.others.particles.log_likelihood
     tree = as_datatree(

@@ -78,13 +78,11 @@ class Progress(NamedTuple):
         return Run(self.cloud, self.log_evidences, course_dataset(self.courses))
 
 
-def advance(progress: Progress, request: Request, show: Callable[[float, str], None]) -> Progress:
+def advance(progress: Progress, request: Request, on_row: Callable[[Progress], None]) -> Progress:
     """Lead a run through all rows of its record that it has not seen."""
     while progress.n_rows < len(progress.rows.record.steps):
         progress = _next_row(progress, request)
-        last = progress.courses[-1]
-        sizes = f"effective size {last.effective_size.mean():.0f}"
-        show(progress.n_rows, f"observation {progress.n_rows}, {sizes}")
+        on_row(progress)
     return progress
 
 

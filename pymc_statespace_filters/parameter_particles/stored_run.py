@@ -7,6 +7,7 @@ one run over all rows.
 """
 
 import json
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -43,9 +44,7 @@ def stored(progress: Progress, request: Request) -> xr.Dataset | None:
     if identity is None:
         return None
     arrays = {f"record_{name}": values for name, values in progress.rows.record._asdict().items()}
-    for prefix, one in zip(_POPULATIONS, progress.cloud[:2], strict=True):
-        arrays |= {f"{prefix}_{name}": v for name, v in one.particles._asdict().items()}
-        arrays[f"{prefix}_log_weights"] = one.log_weights
+    arrays |= arrays_of_cloud(progress.cloud)
     found = {
         name: ([f"{name}_dim_{i}" for i in range(np.ndim(values))], values)
         for name, values in arrays.items()
@@ -58,7 +57,6 @@ def stored(progress: Progress, request: Request) -> xr.Dataset | None:
         "draws": request.draws,
         "waste_free": int(request.size.waste_free),
         "populations": request.n_populations,
-        "scale": progress.cloud.scale,
         "n_members": n_members(progress.rows),
         "inner": request.inner,
     }
@@ -94,21 +92,51 @@ def restored(idata: xr.DataTree, model: pm.Model) -> tuple[Progress, Request]:
     request = Request(draws, size, populations, tuple(json.loads(attrs["entropy"])), attrs["inner"])
     if attrs["n_members"] != n_members(rows):
         rows = rows.of_size(int(attrs["n_members"]))
-    pilot, others = (_populations(state, prefix) for prefix in _POPULATIONS)
-    cloud = Cloud(pilot, others, float(attrs["scale"]))
+    cloud = cloud_of_arrays({str(name): array.values for name, array in state.items()})
     # The dates of a run count from its own origin, whatever the record of a later model.
     rows = rows.with_clock(Clock.restored(attrs)).with_record(_record(state, rows))
     return Progress(rows, cloud, _courses(idata[COURSE].to_dataset())), request
 
 
-def _populations(state: xr.Dataset, prefix: str) -> Populations:
-    x = state[f"{prefix}_x"].values
-    empty = {"seeds": np.empty((len(x), 0), np.int64)}
+def arrays_of_cloud(cloud: Cloud) -> dict[str, np.ndarray]:
+    """Particles with their weights, and what the pilot has learnt, by name."""
+    found = {"scale": np.array(cloud.scale)}
+    for prefix, one in zip(_POPULATIONS, (cloud.pilot, cloud.others), strict=True):
+        found |= {f"{prefix}_{name}": values for name, values in one.particles._asdict().items()}
+        found[f"{prefix}_log_weights"] = one.log_weights
+    return found
+
+
+def cloud_of_arrays(arrays: Mapping[str, np.ndarray]) -> Cloud:
+    """The same from these arrays, of which empty ones may be missing."""
+    pilot, others = (_populations(arrays, prefix) for prefix in _POPULATIONS)
+    return Cloud(pilot, others, float(arrays["scale"]))
+
+
+def _populations(arrays: Mapping[str, np.ndarray], prefix: str) -> Populations:
+    n = len(arrays[f"{prefix}_x"])
+    empty = {"seeds": np.empty((n, 0), np.int64), "states": np.empty((n, 0))}
     fields: dict[str, Any] = {
-        name: state[f"{prefix}_{name}"].values if f"{prefix}_{name}" in state else empty[name]
-        for name in Particles._fields
+        name: arrays.get(f"{prefix}_{name}", empty.get(name)) for name in Particles._fields
     }
-    return Populations(Particles(**fields), state[f"{prefix}_log_weights"].values)
+    return Populations(Particles(**fields), arrays[f"{prefix}_log_weights"])
+
+
+def arrays_of_progress(progress: Progress) -> dict[str, np.ndarray]:
+    """Where a run stands, on its way through a record that is known."""
+    columns = zip(*progress.courses, strict=True)
+    courses = {f"row_{k}": np.array(c) for k, c in zip(RowCourse._fields, columns, strict=True)}
+    members = {"n_members": np.array(n_members(progress.rows))}
+    return arrays_of_cloud(progress.cloud) | courses | members
+
+
+def progress_of_arrays(arrays: Mapping[str, np.ndarray], rows: ObservedRows) -> Progress:
+    """The same from these arrays and the record."""
+    if (size := int(arrays["n_members"])) != n_members(rows):
+        rows = rows.of_size(size)
+    columns = [arrays[f"row_{name}"] for name in RowCourse._fields]
+    courses = [RowCourse(*one) for one in zip(*columns, strict=True)]
+    return Progress(rows, cloud_of_arrays(arrays), courses)
 
 
 def _record(state: xr.Dataset, rows: ObservedRows) -> Record:

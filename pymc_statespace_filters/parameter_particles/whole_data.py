@@ -1,6 +1,7 @@
 """From the prior to the posterior with all data at once, by raising the likelihood to powers."""
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import pymc as pm
@@ -8,9 +9,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..pymc_model.prior import ModelFactors
-from ..smc.bridge import Stage, cross
+from ..smc.bridge import Cloud, Crossed, Stage, cross
 from ..smc.particles import Particles
 from .request import Request, Run, check_alive
+from .stored_run import arrays_of_cloud, cloud_of_arrays
+from .stored_steps import StoredSteps
 
 Array = NDArray[np.float64]
 
@@ -42,19 +45,43 @@ def tempered_run(
     likelihood: WholeLikelihood,
     request: Request,
     show: Callable[[float, str], None],
+    steps: StoredSteps,
 ) -> Run:
-    """Lead draws of the prior to the posterior."""
+    """Lead draws of the prior to the posterior, or particles from where they were stored."""
     rng = request.generator(0)
-    cloud = request.cloud(likelihood.draw(request.n_particles, rng))
-    check_alive(model, cloud)
+    begin: Cloud | Crossed
+    if steps.found:
+        begin = _restored(steps.found, rng)
+    else:
+        begin = request.cloud(likelihood.draw(request.n_particles, rng))
+        check_alive(model, begin)
 
-    def on_stage(stage: Stage) -> None:
+    def on_stage(so_far: Crossed) -> None:
+        stage = so_far.stages[-1]
+        steps.save(lambda: _stored(so_far, rng) | request.arrays, is_last=stage.temperature == 1.0)
         sizes = f"effective size {stage.effective_sizes.mean():.0f}"
         text = f"temperature {stage.temperature:.3g}, {sizes}, acceptance {stage.acceptance:.2f}"
         show(stage.temperature, text)
 
-    found = cross(cloud, likelihood.evaluate, request.size, rng, refresh=True, on_stage=on_stage)
+    found = cross(begin, likelihood.evaluate, request.size, rng, refresh=True, on_stage=on_stage)
     return Run(found.cloud, found.log_ratio, _course(found.stages))
+
+
+def _stored(so_far: Crossed, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """How far a run is, and its next random numbers, as arrays."""
+    columns = zip(*so_far.stages, strict=True)
+    stages = {f"stages_{name}": np.array(c) for name, c in zip(Stage._fields, columns, strict=True)}
+    generator = np.array(json.dumps(rng.bit_generator.state))
+    found = {"log_ratio": so_far.log_ratio, "generator": generator}
+    return arrays_of_cloud(so_far.cloud) | stages | found
+
+
+def _restored(arrays: Mapping[str, np.ndarray], rng: np.random.Generator) -> Crossed:
+    """The same from arrays; the generator is set."""
+    rng.bit_generator.state = json.loads(str(arrays["generator"]))
+    columns = [arrays[f"stages_{name}"] for name in Stage._fields]
+    stages = [Stage(*one) for one in zip(*columns, strict=True)]
+    return Crossed(cloud_of_arrays(arrays), arrays["log_ratio"], stages)
 
 
 def _course(stages: list[Stage]) -> xr.Dataset:

@@ -12,6 +12,8 @@ from pytensor.tensor.random.type import RandomType
 
 from ..system.graph_digest import described, digest, graph_digest
 
+FINGERPRINT_DIGITS = 16  # 64 bits, in a checkpoint and in messages
+
 
 def model_fingerprint(model: pm.Model) -> str:
     """Hash everything that the draws of a model depend on, except for the numbers in its data.

@@ -76,7 +76,8 @@ def _share_arguments(comm: Communicator, ranks: Ranks, given: BoundArguments) ->
     check_same_call(
         comm, lambda: [settings, _identity(values["model"])], {"random_seed": _SEED_ADVICE}
     )
-    if "random_seed" in values and values["random_seed"] is None:
+    # What has a checkpoint goes on with the numbers of a run that had no seed either.
+    if values.get("random_seed", 0) is None and "checkpoint" not in values:
         values["random_seed"] = comm.broadcast(int(np.random.default_rng().integers(2**63)))
     if "idata" in values and not all(comm.allgather(values["idata"] is not None)):
         first = comm.broadcast(values["idata"])

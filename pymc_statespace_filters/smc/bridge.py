@@ -56,7 +56,7 @@ class Cloud(NamedTuple):
 
 
 class Crossed(NamedTuple):
-    """Where a bridge has led, the log of each population's estimate of the ratio, and how."""
+    """How far a bridge has led, the log of each population's estimate of the ratio, and how."""
 
     cloud: Cloud
     log_ratio: Array  # (R,)
@@ -64,25 +64,28 @@ class Crossed(NamedTuple):
 
 
 def cross(
-    cloud: Cloud,
+    begin: Cloud | Crossed,
     evaluate: Evaluate,
     size: Size,
     rng: np.random.Generator,
     *,
     refresh: bool = False,
-    on_stage: Callable[[Stage], None] = lambda stage: None,
+    on_stage: Callable[[Crossed], None] = lambda so_far: None,
 ) -> Crossed:
     """Lead the populations across; with ``refresh`` they are resampled and moved at the end, too.
 
     The increments of the particles are those of the factor; ``evaluate`` gives them at new points.
+    ``on_stage`` is told how far they are, from where another call goes on.
     """
-    temperature, log_ratio = 0.0, np.zeros(len(cloud.others.log_weights))
-    stages: list[Stage] = []
-    while True:
+    if isinstance(begin, Cloud):
+        begin = Crossed(begin, np.zeros(len(begin.others.log_weights)), [])
+    cloud, log_ratio, stages = begin
+    temperature = stages[-1].temperature if stages else 0.0
+    while temperature < 1.0:
         raised = _raised(cloud.pilot, temperature)
         pilot, _ = cloud.pilot.raised(raised - temperature)
         others, log_mean = cloud.others.raised(raised - temperature)
-        log_ratio += log_mean
+        log_ratio = log_ratio + log_mean
         if np.isneginf(log_ratio).all():
             raise ModelError(f"{_NONE_ALIVE} of the populations: raise draws, or narrow the priors")
         temperature, cloud = raised, cloud._replace(pilot=pilot, others=others)
@@ -90,10 +93,10 @@ def cross(
             return Crossed(cloud, log_ratio, stages)
         sizes = sizes_of_evidence(others, log_ratio)
         cloud, moved = _moved(cloud, temperature, evaluate, size, rng)
-        stages.append(Stage(temperature, sizes, moved.n_steps, moved.acceptance, cloud.scale))
-        on_stage(stages[-1])
-        if temperature == 1.0:
-            return Crossed(cloud, log_ratio, stages)
+        stage = Stage(temperature, sizes, moved.n_steps, moved.acceptance, cloud.scale)
+        stages = [*stages, stage]
+        on_stage(Crossed(cloud, log_ratio, stages))
+    return Crossed(cloud, log_ratio, stages)
 
 
 def sizes_of_evidence(others: Populations, log_evidences: Array) -> Array:

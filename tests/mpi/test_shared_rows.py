@@ -1,5 +1,7 @@
 """Functions whose points ranks share: the numbers of one process, on one, two and four ranks."""
 
+import os
+import signal
 import warnings
 
 import arviz as az
@@ -9,6 +11,8 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.native.rows import Rows
+from pymc_statespace_filters.parameter_particles import stored_steps
+from pymc_statespace_filters.parameter_particles.stored_steps import StoredSteps
 from pymc_statespace_filters.pymc_model.prior import ModelPrior
 from tests.mpi.launch import on_ranks
 from tests.parameter_particles.autoregression import model
@@ -17,6 +21,7 @@ SMC = {
     "draws": 20, "populations": 2, "random_seed": 2, "progressbar": False,
     "compute_convergence_checks": False,
 }  # fmt: skip
+SEQUENTIAL = {**SMC, "data": "sequential", "inner": psf.BootstrapPF(6)}
 FOUR = 4
 
 
@@ -38,7 +43,6 @@ def draws():
 def results(idata, comm=None):
     """Particles, and what follows from draws that only the first rank has."""
     built, own = model(psf.EKF(), 9), {"comm": comm, "progressbar": False}
-    smc = {**SMC, "data": "sequential", "inner": psf.BootstrapPF(6)}
     calls = {
         psf.estimate_evidence: {"estimators": "importance", "random_seed": 3},
         psf.reweight: {"filter": psf.BootstrapPF(20), "random_seed": 3},
@@ -47,7 +51,7 @@ def results(idata, comm=None):
     }
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # few particles, and what few draws say
-        particles = psf.sample_smc(model=built, comm=comm, **smc)
+        particles = psf.sample_smc(model=built, comm=comm, **SEQUENTIAL)
         found = [call(idata, built, **own, **of_call) for call, of_call in calls.items()]
     evidence, reweighted, ahead, score = found
     trees = {"particles": particles, "reweighted": reweighted, "ahead": ahead}
@@ -121,3 +125,28 @@ def test_all_ranks_end_with_one():
     assert "per_chain of Ranks must be 1 without chains, got 2" in first["per_chain"]
     alike = {"diverges", "other data", "other seed", "per_chain"}
     assert all(first[fault] == second[fault] for fault in alike)
+
+
+def killed(comm, folder):
+    """A run of two ranks that ends without notice when some rows are stored."""
+    save, saved = StoredSteps.save, []
+
+    def save_and_end(steps, arrays, **settings):
+        save(steps, arrays, **settings)
+        saved.append(1)
+        if len(saved) == 5 and comm.rank == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    stored_steps.SECONDS, StoredSteps.save = 0.0, save_and_end
+    psf.sample_smc(**SEQUENTIAL, model=model(psf.EKF(), 9), comm=comm, checkpoint=folder)
+
+
+@pytest.mark.filterwarnings("ignore:the log-evidence")  # few particles
+def test_a_run_that_was_killed_goes_on_with_another_number_of_ranks(tmp_path):
+    with pytest.raises(AssertionError, match="exit status"):
+        on_ranks(2, killed, tmp_path)
+    assert list(tmp_path.rglob("*.segment"))
+    own = {**SEQUENTIAL, "model": model(psf.EKF(), 9)}
+    resumed, whole = psf.sample_smc(**own, checkpoint=tmp_path), psf.sample_smc(**own)
+    for what, values in _numbers(whole).items():
+        np.testing.assert_array_equal(_numbers(resumed)[what], values, str(what))

@@ -16,14 +16,17 @@ from pytensor.graph.basic import Variable
 
 from ...errors import ModelError
 from ...parallel.ranks import Ranks
-from ...pymc_model.fingerprint import model_data_fingerprint, model_fingerprint
+from ...pymc_model.fingerprint import (
+    FINGERPRINT_DIGITS,
+    model_data_fingerprint,
+    model_fingerprint,
+)
 from ...system.checks import check_count, check_flag, check_positive, is_integer
 from ..target.settings import RandomWalkSettings
 from .continuation import FormerChains
 
 _MOST_ITERATIONS, _MOST_CHAINS = 10**9, 10**4  # whose arrays are too large for a memory
 _MAX_GROWTH = 20  # default of max_draws, in draws
-_FINGERPRINT_DIGITS = 16  # 64 bits, in the checkpoint and in messages
 
 
 class SamplingRequest(NamedTuple):
@@ -86,8 +89,8 @@ class SamplingRequest(NamedTuple):
             "discard_tuned_samples": not self.keeps_warmup,
             **{f.name: repr(getattr(self.settings, f.name)) for f in fields(self.settings)},
             "proposal_cov": _json_value(self.proposal_cov),
-            "model": fingerprint[:_FINGERPRINT_DIGITS],
-            "data": model_data_fingerprint(model)[:_FINGERPRINT_DIGITS],
+            "model": fingerprint[:FINGERPRINT_DIGITS],
+            "data": model_data_fingerprint(model)[:FINGERPRINT_DIGITS],
             "version": version("pymc-statespace-filters"),
         }
 

@@ -1,0 +1,72 @@
+"""A run on its way, in a folder from which it goes on after its process has ended.
+
+The folder is a checkpoint, as that of chains; only the first rank reads and writes it. What is
+stored does not depend on the number of ranks.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from ..parallel.shared_rows import by_first_rank
+from ..sampling.checkpoint.checkpoint import Checkpoint, checked_folder, open_checkpoint
+from ..sampling.checkpoint.journal import ChainJournal
+
+SECONDS = 5.0  # between two records
+_JOURNAL = "particles"
+
+type Arrays = dict[str, np.ndarray]
+
+
+class StoredSteps:
+    """The last step that was stored, and a place for those to come; without a folder neither.
+
+    Attributes
+    ----------
+    found : dict of str to ndarray
+        The last step, on all ranks; empty at the beginning.
+    """
+
+    def __init__(self, found: Arrays | None = None, journal: ChainJournal | None = None) -> None:
+        self.found = found or {}
+        self._journal, self._saved_at = journal, time.monotonic()
+
+    def save(self, arrays: Callable[[], Arrays], *, is_last: bool = False) -> None:
+        """Store a step if some seconds have passed, or if it is the last."""
+        if self._journal is None:
+            return
+        if is_last or time.monotonic() - self._saved_at >= SECONDS:
+            self._journal.append({}, arrays())
+            self._saved_at = time.monotonic()
+
+
+@contextmanager
+def steps_stored_in(
+    folder: Any, settings: Callable[[], Mapping[str, Any]]
+) -> Iterator[StoredSteps]:
+    """Open the folder of a checkpoint, or none; ``settings`` are all that the run depends on.
+
+    Raises
+    ------
+    DataMismatchError, ModelError, CheckpointError
+        As `open_checkpoint` and `ChainJournal.read`.
+    """
+    if folder is None:
+        yield StoredSteps()
+        return
+    opened: list[Checkpoint] = []
+
+    def begin() -> Arrays:
+        opened.append(open_checkpoint(checked_folder(folder), settings()))
+        stored = opened[0].journal(_JOURNAL).read()
+        return {} if stored is None else stored.state
+
+    try:
+        found = by_first_rank(begin)
+        yield StoredSteps(found, opened[0].journal(_JOURNAL) if opened else None)
+    finally:
+        for checkpoint in opened:
+            checkpoint.close()
