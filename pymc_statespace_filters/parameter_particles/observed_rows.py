@@ -1,7 +1,6 @@
 """The likelihood row by row, of a model whose data are one record of a StateSpace variable."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -15,8 +14,12 @@ from ..filters.protocol import Filter, properties
 from ..pymc_model.filter_rows import FilterRows, ParametersAtPoints, Record
 from ..pymc_model.inspection import resized
 from ..pymc_model.prior import ModelPrior
-from ..pymc_model.state_graphs import StateSpaceVariable, observed_variables
-from ..smc.particles import Particles
+from ..pymc_model.state_graphs import (
+    StateSpaceVariable,
+    observed_variables,
+    with_other_filter,
+)
+from ..smc.particles import Evaluate, Particles
 from ..system.clock import Clock
 
 Array = NDArray[np.float64]
@@ -25,33 +28,38 @@ _LARGEST_SEED = np.iinfo(np.int64).max
 
 @dataclass(frozen=True)
 class ObservedRows:
-    """A model as a prior and one factor of the likelihood for each row of its record."""
+    """A model as a prior and one factor of the likelihood for each row of its record.
+
+    ``screen`` is a cheap filter by which moves are screened, if there is one.
+    """
 
     model: pm.Model
     variable: StateSpaceVariable
     record: Record
     filter: Filter
+    screen: Filter | None = None
 
     @classmethod
-    def of(cls, model: pm.Model) -> Self:
+    def of(cls, model: pm.Model, screen: Filter | None = None) -> Self:
         """Read a model; a `ModelError` if its data do not come row by row."""
         variable = _only_variable(model)
+        if screen is not None:
+            _check_filter(with_other_filter(variable, screen))
         record = variable.steps, variable.observed, variable.inputs, variable.t0
         values = (graph.eval(mode="FAST_COMPILE") for graph in record)
-        return cls(model, variable, Record(*map(np.asarray, values)), variable.filter)
+        return cls(model, variable, Record(*map(np.asarray, values)), variable.filter, screen)
 
     def with_record(self, record: Record) -> Self:
         """The same model of another record."""
-        return type(self)(self.model, self.variable, record, self.filter)
+        return replace(self, record=record)
 
     def with_clock(self, clock: Clock) -> Self:
         """The same model with dates that count from elsewhere."""
-        variable = self.variable._replace(clock=clock)
-        return type(self)(self.model, variable, self.record, self.filter)
+        return replace(self, variable=self.variable._replace(clock=clock))
 
     def of_size(self, n_members: int) -> Self:
         """The same with a filter of another number of members."""
-        return type(self)(self.model, self.variable, self.record, resized(self.filter, n_members))
+        return replace(self, filter=resized(self.filter, n_members))
 
     @property
     def seen_times(self) -> Array:
@@ -123,7 +131,7 @@ class ObservedRows:
         increment[alive], new[alive] = terms[:, 0], after
         return particles._replace(past=past, increment=increment, states=new)
 
-    def at_row(self, row: int) -> Callable[[Array, np.random.Generator], Particles]:
+    def at_row(self, row: int) -> Evaluate:
         """The function of points that gives particles with the factor of one row."""
 
         def evaluate(x: Array, rng: np.random.Generator) -> Particles:
@@ -132,6 +140,10 @@ class ObservedRows:
             return Particles(x, log_prior, terms[:, :-1].sum(axis=1), terms[:, -1], seeds, states)
 
         return evaluate
+
+    def screen_at_row(self, row: int) -> Evaluate | None:
+        """The same by the screen; None without one."""
+        return None if self.screen is None else replace(self, filter=self.screen).at_row(row)
 
     def estimated(
         self, x: Array, n_rows: int, rng: np.random.Generator
@@ -158,9 +170,7 @@ def exchanged(
     return particles._replace(past=past, increment=increment, seeds=seeds, states=states)
 
 
-def exchanging(
-    old: ObservedRows, new: ObservedRows, n_rows: int
-) -> Callable[[Array, np.random.Generator], Particles]:
+def exchanging(old: ObservedRows, new: ObservedRows, n_rows: int) -> Evaluate:
     """The function of points that gives particles with that ratio as their factor."""
 
     def evaluate(x: Array, rng: np.random.Generator) -> Particles:

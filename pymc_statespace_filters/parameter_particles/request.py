@@ -31,6 +31,7 @@ class Request(NamedTuple):
     n_populations: int
     entropy: tuple[int, ...]
     inner: str = ""  # the filter in place of the model's
+    screen: str = ""  # the filter by which moves are screened
 
     @property
     def n_particles(self) -> int:
@@ -61,6 +62,7 @@ class Request(NamedTuple):
             "populations": self.n_populations,
             "waste_free": self.size.waste_free,
             "inner": self.inner,
+            "screen": self.screen,
             "random_seed": list(self.entropy) if is_seeded else None,
             "model": model_fingerprint(model)[:FINGERPRINT_DIGITS],
             "observed and other data": model_data_fingerprint(model)[:FINGERPRINT_DIGITS],

@@ -17,7 +17,7 @@ from ..filters.recommendation import short_form
 from ..parallel.shared_rows import by_first_rank
 from ..progress import stage_progress
 from ..pymc_model.in_step import shared_by_ranks
-from ..pymc_model.inspection import given_model
+from ..pymc_model.inspection import given_model, is_filter
 from ..pymc_model.other_filter import model_with
 from ..pymc_model.prior import ModelFactors
 from ..system.checks import check_flag, check_random_seed
@@ -43,6 +43,7 @@ def sample_smc(
     populations: int = 10,
     inner: Filter | None = None,
     waste_free: bool = True,
+    screen: Filter | None = None,
     random_seed: int | np.random.Generator | None = None,
     progressbar: bool = True,
     compute_convergence_checks: bool = True,
@@ -78,6 +79,10 @@ def sample_smc(
     waste_free : bool
         Whether all states of few long chains are the particles after a move (Dau and Chopin), or
         the last states of as many short chains as there are particles.
+    screen : filter, optional
+        A cheap filter without noise, such as `EKF`, for models with a particle or ensemble filter:
+        moves that it finds unlikely are not evaluated by the other one. The posterior is the same;
+        it pays if the screen's posterior is close.
     random_seed : int or numpy.random.Generator, optional
         Seed, of which the result is a function, on any number of threads and ranks.
     progressbar : bool
@@ -193,12 +198,14 @@ def sample_smc(
     model = given_model(model)
     if inner is not None:
         model = model_with(model, "inner", inner)
+    _check_screen(screen)
     if not (isinstance(data, str) and data in ("tempered", "sequential")):
         raise ModelError(f"data must be 'tempered' or 'sequential', got {data!r}")
     rng = check_random_seed(random_seed)
     entropy = by_first_rank(lambda: tuple(rng.integers(2**63, size=2).tolist()))
     request = checked_request(model, draws, populations, waste_free, entropy)
-    request = request._replace(inner="" if inner is None else short_form(inner))
+    inside, outside = ("" if one is None else short_form(one) for one in (inner, screen))
+    request = request._replace(inner=inside, screen=outside)
     check_flag("progressbar", progressbar)
     checks = check_flag("compute_convergence_checks", compute_convergence_checks)
     is_seeded = random_seed is not None
@@ -213,17 +220,25 @@ def sample_smc(
         if checks:
             doubts_of = checked_at_end(model, own, progressbar=progressbar)
         run = _tempered if data == "tempered" else _sequential
-        return run(model, own, doubts_of, steps, progressbar)
+        return run(model, own, screen, doubts_of, steps, progressbar)
+
+
+def _check_screen(screen: Any) -> None:
+    if screen is not None and (not is_filter(screen) or screen.noisy):
+        raise ModelError(
+            f"screen must be None or a filter without noise, such as psf.EKF(), got {screen!r}"
+        )
 
 
 def _tempered(
     model: pm.Model,
     request: Request,
+    screen: Filter | None,
     doubts_of: DoubtsOf,
     steps: StoredSteps,
     progressbar: bool,
 ) -> xr.DataTree:
-    began, likelihood = perf_counter(), WholeLikelihood(model)
+    began, likelihood = perf_counter(), WholeLikelihood(model, screen)
     with stage_progress(1.0, enabled=progressbar) as show:
         run = tempered_run(model, likelihood, request, show, steps)
         maximum = _maximum(likelihood.factors, run, request)
@@ -238,11 +253,12 @@ def _tempered(
 def _sequential(
     model: pm.Model,
     request: Request,
+    screen: Filter | None,
     doubts_of: DoubtsOf,
     steps: StoredSteps,
     progressbar: bool,
 ) -> xr.DataTree:
-    rows = ObservedRows.of(model)
+    rows = ObservedRows.of(model, screen)
     if steps.found:
         begin = progress_of_arrays(steps.found, rows)
     else:

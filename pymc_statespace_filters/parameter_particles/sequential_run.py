@@ -98,9 +98,10 @@ def _next_row(progress: Progress, request: Request) -> Progress:
     cloud = cloud._replace(pilot=pilot, others=others)
     _check_row(rows, cloud, row)
     n_alive = cloud.others.n_alive
-    found = cross(cloud, rows.at_row(row), request.size, rng)
+    screen = rows.screen_at_row(row)
+    found = cross(cloud, rows.at_row(row), request.size, rng, screen=screen)
     log_evidence, stages = before + found.log_ratio, found.stages
-    n_updates = request.n_particles + (row + 1) * _n_proposals(stages, request)
+    n_updates = request.n_particles + (row + 1) * _n_evaluated(stages)
     variance = np.nan
     if stages and rows.filter.noisy:
         variance = _variance(rows, found.cloud.pilot, row + 1, rng)
@@ -109,7 +110,7 @@ def _next_row(progress: Progress, request: Request) -> Progress:
             rows, found = _doubled(rows, found.cloud, row + 1, request, rng)
             log_evidence = log_evidence + found.log_ratio
             stages = stages + found.stages
-            n_updates += (row + 1) * (request.n_particles + 2 * _n_proposals(found.stages, request))
+            n_updates += (row + 1) * (request.n_particles + 2 * _n_evaluated(found.stages))
     course = RowCourse(
         log_evidence,
         pit,
@@ -141,9 +142,8 @@ def _check_row(rows: ObservedRows, cloud: Cloud, row: int) -> None:
     )
 
 
-def _n_proposals(stages: list[Stage], request: Request) -> int:
-    chains = request.size.n_chains * (1 + request.n_populations)
-    return sum(chains * one.n_steps for one in stages)
+def _n_evaluated(stages: list[Stage]) -> int:
+    return sum(one.n_evaluated for one in stages)
 
 
 def _variance(

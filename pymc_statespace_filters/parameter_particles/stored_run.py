@@ -59,6 +59,7 @@ def stored(progress: Progress, request: Request) -> xr.Dataset | None:
         "populations": request.n_populations,
         "n_members": n_members(progress.rows),
         "inner": request.inner,
+        "screen": request.screen,
     }
     return xr.Dataset(found, attrs=attrs)
 
@@ -81,7 +82,8 @@ def restored(idata: xr.DataTree, model: pm.Model) -> tuple[Progress, Request]:
     state = idata[GROUP].to_dataset()
     attrs = state.attrs
     inner = filter_from(str(attrs["inner"]))
-    rows = ObservedRows.of(model if inner is None else model_with(model, "inner", inner))
+    model = model if inner is None else model_with(model, "inner", inner)
+    rows = ObservedRows.of(model, filter_from(str(attrs["screen"])))
     if _identity(rows) != attrs["model"]:
         raise DataMismatchError(
             "model must be that of idata: its priors, parameters, system, filter or values of "
@@ -89,7 +91,8 @@ def restored(idata: xr.DataTree, model: pm.Model) -> tuple[Progress, Request]:
         )
     draws, populations = int(attrs["draws"]), int(attrs["populations"])
     size = Size.of(draws, bool(attrs["waste_free"]))
-    request = Request(draws, size, populations, tuple(json.loads(attrs["entropy"])), attrs["inner"])
+    filters = str(attrs["inner"]), str(attrs["screen"])
+    request = Request(draws, size, populations, tuple(json.loads(attrs["entropy"])), *filters)
     if attrs["n_members"] != n_members(rows):
         rows = rows.of_size(int(attrs["n_members"]))
     cloud = cloud_of_arrays({str(name): array.values for name, array in state.items()})

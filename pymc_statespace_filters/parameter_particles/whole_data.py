@@ -8,9 +8,11 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
+from ..filters.protocol import Filter
+from ..pymc_model.other_filter import model_with
 from ..pymc_model.prior import ModelFactors
 from ..smc.bridge import Cloud, Crossed, Stage, cross
-from ..smc.particles import Particles
+from ..smc.particles import Evaluate, Particles
 from .request import Request, Run, check_alive
 from .stored_run import arrays_of_cloud, cloud_of_arrays
 from .stored_steps import StoredSteps
@@ -21,11 +23,14 @@ Array = NDArray[np.float64]
 class WholeLikelihood:
     """The likelihood of a model, Potentials included, as one factor after the prior.
 
-    ``factors`` evaluate both.
+    ``factors`` evaluate both; ``screen`` is the same by a cheap filter, if there is one.
     """
 
-    def __init__(self, model: pm.Model) -> None:
+    def __init__(self, model: pm.Model, screen: Filter | None = None) -> None:
         self.factors = ModelFactors(model)
+        self.screen: Evaluate | None = None
+        if screen is not None:
+            self.screen = WholeLikelihood(model_with(model, "screen", screen)).evaluate
 
     def draw(self, count: int, rng: np.random.Generator) -> Particles:
         """Draws of the prior."""
@@ -63,7 +68,15 @@ def tempered_run(
         text = f"temperature {stage.temperature:.3g}, {sizes}, acceptance {stage.acceptance:.2f}"
         show(stage.temperature, text)
 
-    found = cross(begin, likelihood.evaluate, request.size, rng, refresh=True, on_stage=on_stage)
+    found = cross(
+        begin,
+        likelihood.evaluate,
+        request.size,
+        rng,
+        refresh=True,
+        screen=likelihood.screen,
+        on_stage=on_stage,
+    )
     return Run(found.cloud, found.log_ratio, _course(found.stages))
 
 

@@ -45,6 +45,7 @@ class Stage(NamedTuple):
     n_steps: int
     acceptance: float
     scale: float
+    n_evaluated: int  # proposals, those of the pilot included
 
 
 class Cloud(NamedTuple):
@@ -70,11 +71,13 @@ def cross(
     rng: np.random.Generator,
     *,
     refresh: bool = False,
+    screen: Evaluate | None = None,
     on_stage: Callable[[Crossed], None] = lambda so_far: None,
 ) -> Crossed:
     """Lead the populations across; with ``refresh`` they are resampled and moved at the end, too.
 
     The increments of the particles are those of the factor; ``evaluate`` gives them at new points.
+    ``screen`` is a cheap likelihood, in the same factors, by which proposals are screened.
     ``on_stage`` is told how far they are, from where another call goes on.
     """
     if isinstance(begin, Cloud):
@@ -92,8 +95,8 @@ def cross(
         if temperature == 1.0 and not refresh:
             return Crossed(cloud, log_ratio, stages)
         sizes = sizes_of_evidence(others, log_ratio)
-        cloud, moved = _moved(cloud, temperature, evaluate, size, rng)
-        stage = Stage(temperature, sizes, moved.n_steps, moved.acceptance, cloud.scale)
+        cloud, moved, n_evaluated = _moved(cloud, temperature, evaluate, size, rng, screen)
+        stage = Stage(temperature, sizes, moved.n_steps, moved.acceptance, cloud.scale, n_evaluated)
         stages = [*stages, stage]
         on_stage(Crossed(cloud, log_ratio, stages))
     return Crossed(cloud, log_ratio, stages)
@@ -115,10 +118,16 @@ def _raised(pilot: Populations, temperature: float) -> float:
 
 
 def _moved(
-    cloud: Cloud, temperature: float, evaluate: Evaluate, size: Size, rng: np.random.Generator
-) -> tuple[Cloud, Moved]:
-    """The cloud with all populations moved at one temperature, and how the others were."""
-    kernel = fitted_kernel(cloud.pilot, cloud.scale, rng)
+    cloud: Cloud,
+    temperature: float,
+    evaluate: Evaluate,
+    size: Size,
+    rng: np.random.Generator,
+    screen: Evaluate | None,
+) -> tuple[Cloud, Moved, int]:
+    """The cloud with all populations moved at one temperature, how the others were, evaluations."""
+    kernel = fitted_kernel(cloud.pilot, cloud.scale, rng, screen)
     pilot, kernel = move_pilot(cloud.pilot, kernel, temperature, evaluate, size, rng)
     others = move_others(cloud.others, kernel, pilot.n_steps, temperature, evaluate, size, rng)
-    return Cloud(pilot.populations, others.populations, kernel.scale), others
+    n_evaluated = pilot.n_evaluated + others.n_evaluated
+    return Cloud(pilot.populations, others.populations, kernel.scale), others, n_evaluated

@@ -58,6 +58,7 @@ class Moved(NamedTuple):
     populations: Populations
     n_steps: int
     acceptance: float
+    n_evaluated: int  # proposals
 
 
 def move_pilot(
@@ -76,9 +77,9 @@ def move_pilot(
         particles, rate = metropolis(chain[-1], kernel, temperature, evaluate, rng)
         kernel = kernel.scaled(rate.walk)
         chain.append(particles)
-        rates.append(rate.all)
+        rates.append(rate)
     moved = Populations.of_equal_weights(interleaved(chain), 1)
-    return Moved(moved, len(rates), _mean(rates)), kernel
+    return Moved(moved, len(rates), *_summary(rates)), kernel
 
 
 def _until_mixed(
@@ -95,12 +96,13 @@ def _until_mixed(
     for _ in range(MAX_MOVES):
         particles, rate = metropolis(particles, kernel, temperature, evaluate, rng)
         kernel = kernel.scaled(rate.walk)
-        rates.append(rate.all)
+        rates.append(rate)
         before = distance
         distance = (((particles.x - start.x) @ whiten) ** 2).sum(axis=1).mean()
         if len(rates) >= MIN_MOVES and distance - before < MIN_GAIN * distance:
             break
-    return Moved(Populations.of_equal_weights(particles, 1), len(rates), _mean(rates)), kernel
+    moved = Populations.of_equal_weights(particles, 1)
+    return Moved(moved, len(rates), *_summary(rates)), kernel
 
 
 def move_others(
@@ -119,10 +121,13 @@ def move_others(
     for _ in range(n_steps):
         particles, rate = metropolis(chain[-1], kernel, temperature, evaluate, rng)
         chain.append(particles)
-        rates.append(rate.all)
+        rates.append(rate)
     kept = interleaved(chain) if size.waste_free else chain[-1]
-    return Moved(Populations.of_equal_weights(kept, n_populations), n_steps, _mean(rates))
+    moved = Populations.of_equal_weights(kept, n_populations)
+    return Moved(moved, n_steps, *_summary(rates))
 
 
-def _mean(rates: list[float]) -> float:
-    return float(np.mean(rates)) if rates else math.nan
+def _summary(rates: list[Rates]) -> tuple[float, int]:
+    """The mean rate of acceptance, and how many proposals were evaluated."""
+    mean = float(np.mean([one.all for one in rates])) if rates else math.nan
+    return mean, sum(one.n_evaluated for one in rates)

@@ -1,7 +1,7 @@
 """Weighted points of several populations, with what was evaluated at each of them."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,12 +41,13 @@ class Particles(NamedTuple):
         """Copies of the particles with these indices, or those that a mask selects."""
         return type(self)(*(values[index] for values in self))
 
-    def replaced(self, mask: NDArray[np.bool_], others: Self) -> Self:
-        """These particles, with those of ``others`` where the mask says so."""
-        merged = []
+    def moved(self, mask: NDArray[np.bool_], others: Self) -> Self:
+        """These particles, with the ``others``, in turn, where the mask says so."""
+        merged: list[Any] = []
         for old, new in zip(self, others, strict=True):
-            wide = mask.reshape(mask.shape + (1,) * (old.ndim - 1))
-            merged.append(np.where(wide, new, old))
+            values = old.copy()
+            values[mask] = new
+            merged.append(values)
         return type(self)(*merged)
 
 

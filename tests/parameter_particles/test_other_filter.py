@@ -1,4 +1,4 @@
-"""Particles whose filter is not that of the model: `inner`, and what follows from the results."""
+"""Other filters than the model's: `inner`, and what follows from the results; `screen`."""
 
 import numpy as np
 import pymc as pm
@@ -57,6 +57,24 @@ def test_a_biased_filter_is_corrected():
     assert abs(corrected["log_evidence"] - truth.path[-1]) < 4 * corrected["log_evidence_se"] < 0.5
 
 
+@pytest.mark.filterwarnings("ignore:the log-evidence")  # few particles
+@pytest.mark.parametrize("data", ["tempered", "sequential"])
+def test_a_screen_spares_evaluations_and_nothing_else(data):
+    """Within 4 errors of quadrature; the run that is extended is one run."""
+    written, settings = model(psf.BootstrapPF(20)), SMALL | {"data": data, "populations": 6}
+    found = psf.sample_smc(model=written, screen=psf.EKF(), **settings)
+    truth, error = exact(), found.attrs["log_evidence_se"]
+    assert abs(found.attrs["log_evidence"] - truth.path[-1]) < 4 * error < 2.0
+    if data == "tempered":
+        return
+    without = psf.sample_smc(model=written, **settings)
+    assert found["smc"]["n_updates"].sum() < 0.9 * without["smc"]["n_updates"].sum()
+    first = psf.sample_smc(model=model(psf.BootstrapPF(20), 10), screen=psf.EKF(), **settings)
+    more = {"observed": DATA[10:], "steps": STEPS[10:], "progressbar": False}
+    longer = psf.extend(first, written, **more)
+    assert _equal(longer, found, "posterior", "smc", "smc_state")
+
+
 @pytest.mark.parametrize(
     "filter",
     [
@@ -100,6 +118,11 @@ def test_what_is_no_filter_for_the_model_is_refused():
         psf.sample_smc(model=model(psf.EKF(), 3), inner=3)
     with pytest.raises(ModelError, match="GuidedPF cannot: its guide needs the record ahead"):
         psf.sample_smc(model=model(psf.EKF(), 3), inner=psf.GuidedPF(9), data="sequential")
+    with pytest.raises(ModelError, match=r"screen must be .* without noise, .* got EnKF"):
+        psf.sample_smc(model=model(psf.EKF(), 3), screen=psf.EnKF(20))
+    settings = SMALL | {"data": "sequential"}
+    with pytest.raises(ModelError, match="GridFilter cannot: its state does not hold"):
+        psf.sample_smc(model=model(psf.EKF(), 3), screen=psf.GridFilter(), **settings)
     with pm.Model() as other:
         pm.Normal("a")
     with pytest.raises(ModelError, match="inner must be None for a model without"):
