@@ -80,7 +80,9 @@ def interpreted():
     """
     import pytensor
 
-    with pytensor.config.change_flags(mode="FAST_COMPILE"):
+    from tests.modes import AS_IT_STANDS
+
+    with pytensor.config.change_flags(mode=AS_IT_STANDS):
         yield
 
 
