@@ -154,3 +154,35 @@ def test_a_collapse_beside_a_jump_is_not_cured_by_a_guide_or_a_grid():
     assert collapse_remedy(compiled, psf.GuidedPF(9)).startswith("Use BootstrapPF(1000), which")
     kinked = compile_system(system(CONTINUOUS["freeplay"]))
     assert "Use GridFilter(tolerance=0.0001)" in collapse_remedy(kinked, psf.BootstrapPF(9))
+
+
+def test_a_step_of_the_state_is_not_linear_although_its_derivative_is_constant():
+    for equation in (
+        lambda x, q: [0.7 * x[0] + pt.sign(x[0]) + q[0]],
+        lambda x, q: [0.7 * x[0] + 1.5 * (x[0] > 0) + q[0]],
+        lambda x, q: [0.7 * x[0] + pt.switch(x[0] > 1, 1.0, 0.0) + q[0]],
+        lambda x, q: [0.7 * x[0] + pt.cast(x[0], "int64") + q[0]],
+        lambda x, q: [pt.floor(x[0]) + q[0]],
+        lambda x, q: [x[0] + pt.sign(q[0])],
+    ):
+        system = linear_but_for(equation)
+        assert not system.is_linear
+        assert not psf.EKF().is_exact_for(system)
+    for equation in (
+        lambda x, q, t: [pt.switch(t < 3, x[0], 2.0 * x[0]) + q[0]],
+        lambda x, q, t, a: [pt.sign(a) * x[0] + q[0]],
+    ):
+        assert linear_but_for(equation).is_linear
+
+
+def linear_but_for(transition):
+    return compile_system(
+        psf.StateSpaceModel(
+            transition=transition,
+            process_noise=[[0.1]],
+            observation=lambda x: [x[0]],
+            observation_noise=[[1.0]],
+            initial_mean=[0.0],
+            initial_cov=[[1.0]],
+        )
+    )

@@ -1,6 +1,6 @@
 """Whether an equation jumps as the state or a parameter moves: decided on lines.
 
-A jump can only be where an operation of `_STEPPED`, such as the comparison of a switch, changes its
+A jump can only be where an operation of `STEPPED`, such as the comparison of a switch, changes its
 value. Such places are searched on lines, at random parameters, and the equation is evaluated on
 both sides: at a kink, as of ``pt.switch(x > 0, x, 0)``, it leaves no gap. A gap counts beside the
 noise: where a force jumps, the state of a short step jumps by little, and is as good as continuous.
@@ -27,7 +27,7 @@ from ..codegen.functions import unrolled
 from ..codegen.scalarize import NotUnrollableError
 from .symbols import observation_moments, symbols_of, transition_moments
 
-_STEPPED = (
+STEPPED = (
     ps.Sign, ps.Floor, ps.Ceil, ps.Trunc, ps.RoundHalfToEven, ps.RoundHalfAwayFromZero, ps.Mod,
     ps.IntDiv, ps.LT, ps.GT, ps.LE, ps.GE, ps.EQ, ps.NEQ,
 )  # fmt: skip
@@ -80,7 +80,7 @@ def jumping_parameters(system: StateSpaceModel) -> tuple[str, ...]:
     if not system.drifting:
         return ()
     elements = _moments(system.gaussian)
-    stepped = {e for e in _under(elements) if isinstance(e.op, _STEPPED)}
+    stepped = {e for e in _under(elements) if isinstance(e.op, STEPPED)}
     first = system.n - len(system.drifting)
     names = [f"x.{first + i}" for i in range(len(system.drifting))]
     return tuple(
@@ -109,7 +109,7 @@ def stepped_parameters(system: StateSpaceModel) -> tuple[str, ...]:
     everything = _under(elements)
     inputs = {e.args[0] for e in everything if e.op is None}
     moving = frozenset(name for name in inputs if name.split(".")[0] in ("x", "q", "e"))
-    stepped = {e for e in everything if isinstance(e.op, _STEPPED)} - depends_on(elements, moving)
+    stepped = {e for e in everything if isinstance(e.op, STEPPED)} - depends_on(elements, moving)
     scalars = np.repeat(system.parameters, [math.prod(s) for s in system.parameter_shapes])
     found = [
         name
@@ -147,12 +147,12 @@ def _jumps(elements: Sequence[Value], states: frozenset[str], n: int) -> bool:
     The median of the lines decides, because parameters and their ratios may have any value.
     """
     of_mean = depends_on(elements[:n], states)
-    if not any(isinstance(e.op, _STEPPED) for e in of_mean):
+    if not any(isinstance(e.op, STEPPED) for e in of_mean):
         return False
     everything = of_mean | _under(elements)
     # Numbers follow the order in which expressions were made: arguments come first.
     order = sorted(everything, key=lambda e: e.number)
-    stepped = [e for e in order if e in of_mean and isinstance(e.op, _STEPPED)]
+    stepped = [e for e in order if e in of_mean and isinstance(e.op, STEPPED)]
     distances = _distances(len(order))
     rng = np.random.default_rng(0)
     lines = [_on_line(order, elements, stepped, states, rng) for _ in range(_N_LINES)]

@@ -14,10 +14,11 @@ from pytensor.tensor.variable import TensorVariable
 
 from ...system.model import StateSpaceModel
 from ..codegen.emitter import depends_on
-from ..codegen.expressions import in_order, is_constant
+from ..codegen.expressions import Expression, in_order, is_constant
 from ..codegen.function_types import Graph
 from ..codegen.functions import unrolled
 from ..codegen.scalarize import NotUnrollableError
+from .jumps import STEPPED
 from .symbols import (
     SYMBOLS,
     call,
@@ -151,7 +152,11 @@ def has_linear_observation(system: StateSpaceModel) -> bool:
 def _is_linear(system: StateSpaceModel, graph: FrozenFunctionGraph, names: str) -> bool:
     symbols = symbols_of(system)
     value = call(graph, system, symbols)
-    return all(is_free_of(names, jacobian_of(value, symbols[name]), symbols) for name in names)
+    if not all(is_free_of(names, jacobian_of(value, symbols[name]), symbols) for name in names):
+        return False
+    # The Jacobian of a step, as of pt.sign, is zero on both of its sides.
+    found = _dependent(names, value, symbols)
+    return found is not None and not any(isinstance(e.op, (*STEPPED, ps.Cast)) for e in found)
 
 
 def has_additive_process_noise(system: StateSpaceModel) -> bool:
@@ -278,13 +283,21 @@ def is_free_of(
     names: Sequence[str], matrix: TensorVariable, symbols: Mapping[str, TensorVariable]
 ) -> bool:
     """Whether no element depends on the named symbols; False where that cannot be decided."""
+    found = _dependent(names, matrix, symbols)
+    return found is not None and not found
+
+
+def _dependent(
+    names: Sequence[str], matrix: TensorVariable, symbols: Mapping[str, TensorVariable]
+) -> set[Expression] | None:
+    """The expressions under the elements that depend on the named symbols; None if undecided."""
     try:
         (values,) = unrolled(Graph(symbols, [matrix.ravel()]))
     except NotUnrollableError:
-        return False
+        return None
     sizes = {name: int(np.prod(symbols[name].type.shape, dtype=int)) for name in names}
     inputs = {f"{name}.{i}" for name, size in sizes.items() for i in range(size)}
-    return not depends_on(values, frozenset(inputs))
+    return depends_on(values, frozenset(inputs))
 
 
 def parameters_after_start(system: StateSpaceModel) -> list[bool]:
