@@ -11,7 +11,7 @@ from scipy.special import betaln, logsumexp
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.terms import chain
+from pymc_statespace_filters.terms import chain, enumeration
 from tests.terms.regression import Regression
 
 
@@ -147,23 +147,7 @@ def test_what_only_an_absent_term_uses_has_its_prior():
     assert abs(gap.mean() - 2 / 7) < 5 * 0.16 / len(gap) ** 0.5
 
 
-def test_what_comes_and_goes_together():
-    regression = few_terms()
-    absent = {("b0", "b1"): (0.0, 0.0), "b2": 0.0, "b3": 0.0}
-    found = psf.select_terms(
-        regression.model(), absent, idata=regression.draws(1), random_seed=2, progressbar=False
-    )
-    assert list(found["terms"]["term"].values) == ["b0, b1", "b2", "b3"]
-    evidence = dict(zip(map(tuple, regression.sets), regression.log_evidence, strict=True))
-    models = found["models"]
-    for present, value, error in zip(
-        models["present"].values, models["log_evidence"].values, models["se"].values, strict=True
-    ):
-        pair, *others = present
-        assert abs(value - evidence[(pair, pair, *others)]) < 4 * error + 1e-6
-
-
-def test_elements_of_a_vector():
+def test_elements_of_a_vector_that_come_and_go_together():
     regression = few_terms()
     with pm.Model() as model:
         b = pm.Normal("b", 0, 1, shape=3)
@@ -173,14 +157,18 @@ def test_elements_of_a_vector():
     scalars = regression.draws(1)["posterior"].to_dataset()
     vector = np.stack([scalars[f"b{i}"].values for i in range(3)], axis=-1)
     posterior = xr.Dataset({"b": (("chain", "draw", "term"), vector), "b3": scalars["b3"]})
-    absent = {"b[0]": 0.0, "b[1]": 0.0, "b[2]": 0.0, "b3": 0.0}
-    found = psf.select_terms(
-        model, absent, idata=xr.DataTree.from_dict({"posterior": posterior}), random_seed=2,
-        progressbar=False,
-    )  # fmt: skip
-    scalar = few_selected()["models"]
-    np.testing.assert_allclose(found["models"]["log_evidence"], scalar["log_evidence"], rtol=1e-9)
+    idata = xr.DataTree.from_dict({"posterior": posterior})
+    absent = {("b[0]", "b[1]"): (0.0, 0.0), "b[2]": 0.0, "b3": 0.0}
+    found = psf.select_terms(model, absent, idata=idata, random_seed=2, progressbar=False)
+    assert list(found["terms"]["term"].values) == ["b[0], b[1]", "b[2]", "b3"]
     assert found["posterior"]["b"].dims == ("chain", "draw", "term")
+    evidence = dict(zip(map(tuple, regression.sets), regression.log_evidence, strict=True))
+    models = found["models"]
+    for present, value, error in zip(
+        models["present"].values, models["log_evidence"].values, models["se"].values, strict=True
+    ):
+        pair, *others = present
+        assert abs(value - evidence[(pair, pair, *others)]) < 4 * error + 1e-6
 
 
 def test_states_of_averaged_draws():
@@ -247,6 +235,14 @@ def test_a_likelihood_that_is_not_finite_is_named():
         psf.select_terms(model, {"sd": 0.0}, idata=draws_of(mu=0.7, sd=1), progressbar=False)
 
 
+def test_an_improper_slab_is_refused():
+    with pm.Model() as model:
+        mu = pm.Flat("mu")
+        pm.Normal("y", mu, 1.0, observed=[0.5, 1.0])
+    with pytest.raises(ModelError, match="the prior of 'mu' is improper"):
+        psf.select_terms(model, {"mu": 0.0}, idata=draws_of(mu=0.7), progressbar=False)
+
+
 def test_elements_with_a_joint_density_are_refused():
     with pm.Model() as model:
         b = pm.MvNormal("b", np.zeros(2), np.eye(2))
@@ -270,7 +266,8 @@ def test_slabs_of_other_widths():
     psf.plot_prior_sensitivity(curves, backend="none")
 
 
-def test_noisy_likelihoods_have_the_evidences_of_exact_ones():
+def test_noisy_likelihoods_have_the_evidences_of_exact_ones(monkeypatch):
+    monkeypatch.setattr(enumeration, "NOISY_SE", 0.03)
     system = psf.StateSpaceModel(
         transition=lambda x, q, u, a, b: [a * x[0] + b * u[0] + q[0]],
         process_noise=[[0.2]],
@@ -301,7 +298,7 @@ def test_noisy_likelihoods_have_the_evidences_of_exact_ones():
         [one["terms"][name].values for name in ("inclusion", "inclusion_se")] for one in found
     )
     assert (np.abs(noisy - exact) < 4 * np.hypot(se, 0.002)).all()
-    assert (se < 0.02).all()
+    assert (se < 0.04).all()
     seeds = found[1]["sample_stats"]["y_seed"].values
     assert len(np.unique(seeds)) > 100
 
