@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from ..evidence.comparison.prior_sensitivity import width_factors
-from ..pymc_model.inspection import filters_used
+from ..pymc_model.inspection import exactness, filters_used
 from .candidates import Candidates
 from .density import Sets, SubmodelDensity
 from .draws import Averaged, posterior_of
@@ -45,7 +45,7 @@ def as_datatree(
     }
     groups |= {name: idata[name].to_dataset() for name in COPIED if name in idata.children}
     tree = xr.DataTree.from_dict(groups)
-    tree.attrs |= filters_used(density.model)
+    tree.attrs |= filters_used(density.model) | {"exact": int(exactness(density.model))}
     return tree
 
 

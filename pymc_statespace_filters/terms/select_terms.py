@@ -87,7 +87,9 @@ def select_terms(
 
         ``posterior`` : draws averaged over the sub-models, with all variables of the full model.
         Where a draw lacks a term, its variables have the values of ``absent``. ``sample_stats`` has
-        the sub-model of each draw, and the noise seed of its likelihood.
+        the sub-model of each draw, and the noise seed of its likelihood. The attributes ``filter``
+        and ``exact`` are as of `sample_dram`: with a filter that approximates the likelihood, so do
+        the probabilities.
 
     Raises
     ------

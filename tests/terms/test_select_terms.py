@@ -299,6 +299,7 @@ def test_noisy_likelihoods_have_the_evidences_of_exact_ones(monkeypatch):
     )
     assert (np.abs(noisy - exact) < 4 * np.hypot(se, 0.002)).all()
     assert (se < 0.04).all()
+    assert [one.attrs["exact"] for one in found] == [1, 1]
     seeds = found[1]["sample_stats"]["y_seed"].values
     assert len(np.unique(seeds)) > 100
 
