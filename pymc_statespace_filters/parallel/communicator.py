@@ -136,10 +136,7 @@ class Communicator:
     def barrier(self) -> None:
         """Wait for all ranks without keeping a core busy."""
         if self._comm is not None:
-            request, pause = self._comm.Ibarrier(), _FIRST_POLL_SECONDS
-            while not request.Test():
-                time.sleep(pause)
-                pause = min(1.5 * pause, _POLL_SECONDS)
+            _wait([self._comm.Ibarrier()])
 
     def allgather(self, value: Any) -> list[Any]:
         """The values of all ranks, on all of them."""
@@ -211,12 +208,16 @@ class Communicator:
             "ranks must make the same call, with the same data, random_seed and software"
         )
 
-    def share_rows(self, array: np.ndarray, parts: Sequence[tuple[int, int]]) -> None:
-        """Fill in the rows of a contiguous array that other ranks have, from first to last row."""
+    def share_rows(self, arrays: Sequence[np.ndarray], parts: Sequence[tuple[int, int]]) -> None:
+        """Fill in the rows of contiguous arrays that other ranks have, from first to last row."""
         if self._comm is not None:
-            for rank, (first, last) in enumerate(parts):
-                for piece in _pieces([array[first:last]]):
-                    self._comm.Bcast(piece, rank)
+            _wait(
+                [
+                    self._comm.Ibcast(piece, rank)
+                    for rank, (first, last) in enumerate(parts)
+                    for piece in _pieces([array[first:last] for array in arrays])
+                ]
+            )
 
     # Messages between two ranks
 
@@ -338,6 +339,14 @@ def describe_error(error: BaseException) -> str:
     """Describe an error in one line: type, message and notes."""
     notes = "; ".join(getattr(error, "__notes__", ()))
     return f"{type(error).__name__}: {error}" + (f" ({notes})" if notes else "")
+
+
+def _wait(requests: list[Any]) -> None:
+    """Wait until all are complete, without keeping a core busy."""
+    pause = _FIRST_POLL_SECONDS
+    while not mpi().Request.Testall(requests):
+        time.sleep(pause)
+        pause = min(1.5 * pause, _POLL_SECONDS)
 
 
 def _pieces(arrays: Sequence[np.ndarray]) -> "Sequence[memoryview]":

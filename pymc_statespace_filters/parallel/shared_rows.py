@@ -69,11 +69,10 @@ def evaluated_rows(
         return evaluate(own)
 
     results = list(empty(m))
-    for result, part in zip(
-        results, comm.run_collectively(evaluate_own, _mark(columns)), strict=True
-    ):
+    parts = comm.run_collectively(evaluate_own, _mark(columns))
+    for result, part in zip(results, parts, strict=True):
         result[own] = part
-        comm.share_rows(result, list(pairwise(ends)))
+    comm.share_rows(results, list(pairwise(ends)))
     return results
 
 

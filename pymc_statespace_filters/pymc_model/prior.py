@@ -182,7 +182,9 @@ class ModelPrior:
 
     @cached_property
     def _density(self) -> RowFunction:
-        return RowFunction(self._model, self._model.logp(vars=self._free))
+        density = RowFunction(self._model, self._model.logp(vars=self._free))
+        density.calls.is_shared = False
+        return density
 
     @cached_property
     def _draw(self) -> tuple[Any, list[SharedVariable]]:
