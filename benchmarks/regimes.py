@@ -6,11 +6,20 @@ its mean over seeds minus the exact one, its standard deviation, CPU millisecond
 and variance times time relative to ``BootstrapPF(1000)``. Exact is the log of the mean likelihood
 of ``RBPF(20_000)``, which is unbiased. Run it with ``python -m benchmarks.regimes`` from the root
 of the repository; it takes a minute.
+
+``python -m benchmarks.regimes ENVIRONMENT`` compares NUTS with that of NumPyro instead, for a
+hidden Markov model of a thousand observations. ENVIRONMENT is a folder in which dynamax and numpyro
+are installed: ``python -m venv ENVIRONMENT; ENVIRONMENT/bin/pip install dynamax numpyro``.
 """
 
+import subprocess
+import sys
+import tempfile
 import time
 import warnings
+from pathlib import Path
 
+import arviz as az
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
@@ -77,5 +86,62 @@ def main():
             print(f"{filter} | {bias:+.3f} +- {sd:.3f} | {ratio}")
 
 
+HMM = psf.StateSpaceModel(
+    transition=lambda x, q: [q[0]],
+    process_dist=lambda x, up, down: [pm.Bernoulli.dist(pt.switch(x[0] > 0.5, 1 - down, up))],
+    observation=lambda x, level: [level * x[0]],
+    observation_noise=lambda s: [[s**2]],
+    initial_dist=lambda up, down: [pm.Bernoulli.dist(up / (up + down))],
+    states=["regime"],
+)
+N_CHAINS, N_DRAWS = 2, 300
+
+
+def hidden_markov_model(observed):
+    """Two regimes, of which one has the mean zero."""
+    with pm.Model() as model:
+        pm.Beta("up", 1, 9)
+        pm.Beta("down", 1, 9)
+        pm.Normal("level", 0, 2)
+        pm.HalfNormal("s", 1)
+        psf.StateSpace(
+            "d", HMM, psf.FiniteStateFilter(), steps=np.arange(len(observed)), observed=observed
+        )
+    return model
+
+
+def _report(name, posterior, seconds):
+    effective = min(float(x) for x in az.ess(posterior).data_vars.values())
+    mean = {key: round(float(x), 3) for key, x in posterior.mean().data_vars.items()}
+    print(f"{name} | {effective:.0f} in {seconds:.1f} s: {effective / seconds:.0f} / s | {mean}")
+
+
+def compare_with_dynamax(environment):
+    """Print effective draws per CPU second of runs whose code is compiled, tuning included."""
+    truth = {"up": 0.1, "down": 0.2, "level": 1.0, "s": 0.5}
+    record = psf.simulate(HMM, truth, steps=np.arange(1000), random_seed=1)
+    observed = record["observations"].values
+    settings = {"chains": N_CHAINS, "cores": 1, "progressbar": False, "sampler": "nuts"}
+    with hidden_markov_model(observed):
+        psf.sample(20, tune=20, random_seed=1, **settings)
+        began = time.process_time()
+        idata = psf.sample(N_DRAWS, tune=N_DRAWS, random_seed=2, **settings)
+        seconds = time.process_time() - began
+    _report("psf.sample", idata["posterior"].to_dataset(), seconds)
+    with tempfile.TemporaryDirectory() as folder:
+        data, draws = Path(folder, "data.npy"), Path(folder, "draws.npz")
+        np.save(data, observed[:, 0])
+        python = Path(environment, "bin", "python")
+        words = [python, "-m", "benchmarks.peers.dynamax_hmm", data, draws, N_CHAINS, N_DRAWS]
+        subprocess.run(list(map(str, words)), check=True)
+        found = dict(np.load(draws))
+    seconds = float(found.pop("seconds"))
+    posterior = az.from_dict({"posterior": found})["posterior"].to_dataset()
+    _report("dynamax, NumPyro", posterior, seconds)
+
+
 if __name__ == "__main__":
-    main()
+    if len(sys.argv) > 1:
+        compare_with_dynamax(sys.argv[1])
+    else:
+        main()
