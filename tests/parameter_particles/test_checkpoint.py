@@ -94,7 +94,7 @@ def test_rivals_have_folders_of_their_own(tmp_path, often, monkeypatch):
     settings = {**SETTINGS, "sampler": "smc"}
     whole = psf.run_models(models, **settings)
     with monkeypatch.context() as patch:
-        ending_after(3, patch)
+        ending_after(2, patch)
         with pytest.raises(Ended):
             psf.run_models(models, **settings, checkpoint=tmp_path)
     resumed = psf.run_models(models, **settings, checkpoint=tmp_path)
