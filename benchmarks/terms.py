@@ -7,15 +7,22 @@ logistic regression of presence on the reported log odds has intercept 0 and slo
 ``python -m benchmarks.terms 300`` prints, of 300 records, these two with their errors, z of
 sum(presence - probability), and the mean CPU seconds of a record; a second number is the first
 seed, and ``particles`` a third argument that takes `BootstrapPF(200)` instead of the exact `EKF`.
+Beside them are those of the exact probabilities, by quadrature over the noise and in closed form
+over the coefficients, and how far the reported ones are from these.
+
+Exact probabilities of 1000 records from seed 1001: intercept 0.03 (0.05), slope 1.03 (0.04), z 0.4.
+Twelve records from seed 101: reported minus exact has rms 0.003 and is 0.008 at most.
 """
 
 import logging
+import math
 import sys
 import time
 import warnings
 
 import numpy as np
 import pymc as pm
+from scipy.stats import halfnorm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning, FilterWarning
@@ -38,8 +45,39 @@ SYSTEM = psf.StateSpaceModel(
 )
 
 
+SUBSETS = (np.arange(2**N_TERMS)[:, None] >> np.arange(N_TERMS) & 1).astype(bool)
+SIGMAS = np.linspace(0.005, 2.5, 80)
+
+
+def exact_probabilities(observed):
+    """The probabilities (K,) of the terms, given observations (J,)."""
+    ages = np.subtract.outer(STEPS, STEPS)
+    response = np.where(ages >= 0, 0.7 ** np.maximum(ages, 0), 0.0)
+    inputs, start = response @ INPUTS, 0.7**STEPS
+    log_evidence = np.empty((len(SUBSETS), len(SIGMAS)))
+    for column, sigma in zip(log_evidence.T, SIGMAS, strict=True):
+        cov = 0.1 * np.outer(start, start) + 0.2 * np.eye(N_ROWS) + sigma**2 * response @ response.T
+        chol = np.linalg.cholesky(cov)
+        y, design = (np.linalg.solve(chol, values) for values in (observed, inputs))
+        fixed = -0.5 * y @ y - np.log(np.diag(chol)).sum() + halfnorm(scale=0.5).logpdf(sigma)
+        column[:] = [fixed + _gain(design[:, one], y) for one in SUBSETS]
+    n = SUBSETS.sum(axis=1)
+    log_prior = [-math.log((N_TERMS + 1) * math.comb(N_TERMS, size)) for size in n]
+    height = np.logaddexp.reduce(log_evidence, axis=1) + log_prior
+    weights = np.exp(height - height.max())
+    return weights @ SUBSETS / weights.sum()
+
+
+def _gain(design, y):
+    """The log-evidence of a regression on y of unit errors, minus that without terms."""
+    n = design.shape[1]
+    chol = np.linalg.cholesky(np.eye(n) / SLAB**2 + design.T @ design)
+    v = np.linalg.solve(chol, design.T @ y)
+    return 0.5 * v @ v - np.log(np.diag(chol)).sum() - n * math.log(SLAB)
+
+
 def one_record(seed, filter):
-    """Which terms are there, their reported probabilities, and the CPU seconds."""
+    """Which terms are there, their reported and exact probabilities, and the CPU seconds."""
     rng = np.random.default_rng(seed)
     present = np.zeros(N_TERMS, dtype=bool)
     present[rng.permutation(N_TERMS)[: rng.integers(N_TERMS + 1)]] = True
@@ -59,7 +97,9 @@ def one_record(seed, filter):
     found = psf.select_terms(
         model, dict.fromkeys(NAMES, 0.0), idata=idata, random_seed=rng, progressbar=False
     )
-    return present, found["terms"]["inclusion"].values, time.process_time() - begin
+    seconds = time.process_time() - begin
+    exact = exact_probabilities(record["observations"].values[:, 0])
+    return present, found["terms"]["inclusion"].values, exact, seconds
 
 
 def logistic_regression(log_odds, presence, groups):
@@ -82,16 +122,24 @@ def main(count, first=1, kind="exact"):
     warnings.simplefilter("ignore", EvidenceWarning)
     warnings.simplefilter("ignore", FilterWarning)
     found = [one_record(seed, filter) for seed in range(first, first + count)]
-    presence = np.concatenate([one for one, _, _ in found]).astype(float)
-    p = np.clip(np.concatenate([one for _, one, _ in found]), 1e-9, 1 - 1e-9)
-    beta, error = logistic_regression(
-        np.log(p / (1 - p)), presence, np.repeat(np.arange(count), N_TERMS)
-    )
-    differences = (presence - p).reshape(count, N_TERMS).sum(axis=1)
+    presence, reported, exact, seconds = (np.array(part) for part in zip(*found, strict=True))
     print(f"{count} records from seed {first}, {kind}")
-    print(f"intercept {beta[0]:.2f} ({error[0]:.2f}), slope {beta[1]:.2f} ({error[1]:.2f})")
-    print(f"z of the sum {differences.sum() / np.sqrt((differences**2).sum()):.1f}")
-    print(f"{np.mean([seconds for _, _, seconds in found]):.1f} CPU s a record")
+    for name, p in (("reported", reported), ("exact", exact)):
+        inside = np.clip(p, 1e-9, 1 - 1e-9).ravel()
+        beta, error = logistic_regression(
+            np.log(inside / (1 - inside)),
+            presence.ravel().astype(float),
+            np.repeat(np.arange(count), N_TERMS),
+        )
+        differences = (presence - p).sum(axis=1)
+        z = differences.sum() / np.sqrt((differences**2).sum())
+        print(
+            f"{name}: intercept {beta[0]:.2f} ({error[0]:.2f}), slope {beta[1]:.2f} "
+            f"({error[1]:.2f}), z of the sum {z:.1f}"
+        )
+    off = reported - exact
+    print(f"reported - exact: rms {np.sqrt((off**2).mean()):.4f}, largest {abs(off).max():.4f}")
+    print(f"{seconds.mean():.1f} CPU s a record")
 
 
 if __name__ == "__main__":
