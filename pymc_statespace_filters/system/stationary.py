@@ -4,11 +4,12 @@ from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
-from pytensor.tensor.linalg import solve
 from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
 from .equations import as_symbol, static_shape
+
+_LEAST = 1e-300  # added to the probability of leaving a value, which may be zero
 
 
 def stationary(probabilities: Any) -> TensorVariable:
@@ -46,7 +47,24 @@ def stationary(probabilities: Any) -> TensorVariable:
         raise ModelError(
             f"probabilities must be a square matrix of static shape, got the shape {shape}"
         )
-    size = shape[0]
-    # Of pi (I - P) = 0 and sum(pi) = 1: the second is added to every equation of the first.
-    equations = pt.eye(size) - matrix.T + np.ones((size, size))
-    return pt.specify_shape(solve(equations, np.ones(size), b_ndim=1), (size,))
+    return pt.specify_shape(_solved(matrix, shape[0]), (shape[0],))
+
+
+def _solved(matrix: TensorVariable, size: int) -> TensorVariable:
+    """The solution by elimination of one value after the other, without pivots or differences.
+
+    W. K. Grassmann, M. I. Taksar and D. P. Heyman, "Regenerative analysis and steady state
+    distributions for Markov chains", Operations Research 33 (1985). Their divisions of the result
+    are left out: it may be zero.
+    """
+    eliminated = []
+    for _ in range(size - 1):
+        leaving, reaching = matrix[-1, :-1], matrix[:-1, -1]
+        total = leaving.sum() + _LEAST
+        matrix = matrix[:-1, :-1] + reaching[:, np.newaxis] * (leaving / total)
+        eliminated.append((reaching, total))
+    found = pt.ones(1)
+    for reaching, total in reversed(eliminated):
+        found = pt.concatenate([found * total, pt.sum(found * reaching, keepdims=True)])
+        found = found / found.sum()
+    return found
