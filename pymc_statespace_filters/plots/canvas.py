@@ -19,7 +19,8 @@ PANELS_IN_LINE = 4
 # Of an axis, at most: between them labels of years have room.
 N_TICKS, TICKS_PER_INCH = 8, 1.4
 DOTS_PER_INCH = 100
-# Width in dots of a letter, and of the sample line with the gaps of an entry.
+# Width in dots of a letter, and of the sample line with the gaps of an entry; of matplotlib with
+# letters of ten points.
 LETTER = {"matplotlib": 7.5, "bokeh": 6.2}
 TITLE, MARGINS = 30.0, 150.0  # heights in dots, of plotly
 SAMPLE = {"matplotlib": 65.0, "bokeh": 34.0}
@@ -313,10 +314,18 @@ def add_legend(
 
 
 def _width(collection: PlotCollection) -> float:
-    """Return the room for the legend in dots: the figure's width, or that of a panel of bokeh."""
+    """Return the room for the legend in dots: the figure's width, or that of a panel of bokeh.
+
+    That of matplotlib is relative to its letters, whose size is a matter of style.
+    """
     if collection.backend == "bokeh":
         return float(collection.iget_target(0, -1).width)
-    return float(DOTS_PER_INCH * collection.viz["figure"].item().get_size_inches()[0])
+    matplotlib = import_module("matplotlib")
+    size = import_module("matplotlib.font_manager").FontProperties(
+        size=matplotlib.rcParams["legend.fontsize"]
+    )
+    inches = collection.viz["figure"].item().get_size_inches()[0]
+    return float(DOTS_PER_INCH * inches * 10.0 / size.get_size_in_points())
 
 
 def _height(collection: PlotCollection) -> float:

@@ -1,5 +1,6 @@
 """Curves of probability against the width of the priors, of a given Dataset."""
 
+import matplotlib
 import numpy as np
 import pytest
 import xarray as xr
@@ -119,3 +120,15 @@ def test_what_is_refused(table):
     for given in (xr.Dataset(), None, table):
         with pytest.raises(ModelError, match="curves must be the result of prior_sensitivity"):
             plot_prior_sensitivity(given)
+
+
+@pytest.mark.parametrize("size", [8, 14])
+def test_a_legend_is_no_wider_than_its_figure(size):
+    """With letters of any size."""
+    found = of_widths(np.full((3, 2), 0.5)).isel(model=[0] * 8)
+    found = found.assign_coords(model=[f"k[{i}]" for i in range(8)])
+    with matplotlib.rc_context({"legend.fontsize": size}):
+        figure = plot_prior_sensitivity(found, backend="matplotlib").viz["figure"].item()
+        figure.draw_without_rendering()
+        box = figure.legends[0].get_window_extent()
+    assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1
