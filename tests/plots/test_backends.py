@@ -17,7 +17,9 @@ from pymc_statespace_filters import (
     plot_prior_sensitivity,
     plot_residuals,
     plot_states,
+    plot_terms,
 )
+from tests.plots.test_terms import TERMS
 
 
 def portrait(idata, **settings):
@@ -49,7 +51,13 @@ PLOTS = [
     (plot_states, "simulated"),
     (run_free, "free_run"),
     (errors_of, "free_run"),
+    (plot_terms, "terms"),
 ]
+
+
+@pytest.fixture(scope="session")
+def terms():
+    return xr.DataTree.from_dict({"terms": TERMS})
 
 
 @pytest.fixture(scope="session")
