@@ -121,7 +121,7 @@ def until_certain(
     target = NOISY_SE if sampler.is_noisy else TARGET_SE
     for _ in range(N_ROUNDS):
         known = probabilities(points, sets, log_prior)
-        more = np.minimum(_missing(known, [one.count for one in points], target), left)
+        more = _missing(known, [one.count for one in points], target, left)
         chosen = np.flatnonzero(more * [len(one.x) for one in points])
         if not chosen.size:
             break
@@ -165,12 +165,16 @@ def _least(known: Probabilities) -> np.ndarray:
     return np.ceil(ENOUGH * np.minimum(known.influence() / LARGE, 1.0)).astype(np.int64)
 
 
-def _missing(known: Probabilities, counts: Sequence[int], target: float) -> np.ndarray:
-    """How many points each sub-model lacks, (S,); at most as many as all have now."""
+def _missing(known: Probabilities, counts: Sequence[int], target: float, left: int) -> np.ndarray:
+    """How many points each sub-model lacks, (S,); together at most ``left``.
+
+    They are also at most as many as all have now: new points show what is missing more exactly.
+    """
     n = np.array(counts)
     spread = np.where(np.isfinite(known.error), known.error, 0.0) * np.sqrt(n)
     share = known.influence() * spread
     needed = np.maximum(share * share.sum() / target**2, _least(known))
     missing = np.maximum(np.ceil(needed - n), 0)
-    scale = min(1.0, n[share > 0].sum() / max(missing.sum(), 1.0))
-    return np.ceil(scale * missing).astype(np.int64)
+    most = min(n[share > 0].sum(), left)
+    scale = min(1.0, most / max(missing.sum(), 1.0))
+    return np.floor(scale * missing).astype(np.int64)
