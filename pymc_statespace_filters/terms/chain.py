@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from ..importance import mcse_of_chains
 from .density import Array, Sets
-from .enumeration import N_SCREENED, REACH, Announce, improved, proposals_of
 from .estimates import Sampler, Visits, Weighted
 from .inclusion import InclusionPrior
 from .proposals import Guide
+from .screening import REACH, Announce, improved, proposals_of, screened
 from .unused import Uses
 
 N_CHAINS, N_STEPS, N_DROPPED = 4, 1000, 200  # the first steps are dropped
@@ -84,12 +84,13 @@ class _Met:
             return
         sets = np.array(list(new.values()))
         first = proposals_of(sets, self._guide, self._uses, self._sampler)
-        found = self._sampler.draw(first, [N_SCREENED] * len(first))
-        height = self._heights(found, sets)
-        self._highest = max(self._highest, height.max())
-        within = np.flatnonzero(height > self._highest - REACH).tolist()
-        chosen = [first[i] for i in within]
-        better = improved(chosen, self._sampler, self._rng, lambda task, total: None)
+        log_prior = self._prior.log_weight(sets)
+        found, chosen = screened(first, log_prior, self._sampler, self._rng, self._highest)
+        self._highest = max(self._highest, self._heights(found, sets).max())
+        within = np.flatnonzero(chosen).tolist()
+        better = improved(
+            [found[i].proposal for i in within], self._sampler, self._rng, lambda task, total: None
+        )
         for i, one in zip(within, better, strict=True):
             found[i] = one
         self._pilots |= dict(zip(new, found, strict=True))

@@ -12,6 +12,7 @@ from .probabilities import Probabilities
 
 MAX_SHARE = 0.01  # of the probability, in sub-models of unreliable evidence
 MOST_APART, LEAST_APART = 4.0, 0.02  # of visits and probabilities: errors, and at least
+LEAST_OF_FULL = 5.0  # effective points of the full model
 NEGLIGIBLE = 0.005  # probability of a single one
 
 
@@ -43,8 +44,16 @@ def doubts(
     points: Sequence[Weighted],
     candidates: Candidates,
     visits: Visits | None,
+    full: Weighted,
 ) -> Iterator[str]:
-    """Why the errors of inclusions may be too small."""
+    """Why the errors of inclusions may be too small; ``full`` has points of the full model."""
+    if full.n_effective < LEAST_OF_FULL:
+        yield (
+            "idata seems to have no draws of the posterior of this model, or too few: of "
+            f"{full.count} points drawn like them {full.n_effective:.1f} are effective in the full "
+            "model, and no better proposal was found: give draws of the model, as sample does, or "
+            "a filter with more particles where the likelihood is noisy"
+        )
     poor = unreliable(found, points)
     share = float(found.of_models[poor].sum())
     if share > MAX_SHARE:

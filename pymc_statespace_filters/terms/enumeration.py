@@ -1,11 +1,11 @@
 """All sub-models: evaluations go to those that matter, by successive halving.
 
-A few points of each say which sub-models are out of reach. The proposals of the others are fitted
-again until their weights are good. Then points are added where they reduce the error of an
+A few points of each say which sub-models are out of reach (`screening`). The proposals of the
+others are fitted again until their weights are good. Then points are added where they reduce the error of an
 inclusion most (Neyman 1934).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -15,19 +15,14 @@ from .doubts import check_finite
 from .estimates import Sampler, Weighted
 from .inclusion import InclusionPrior
 from .probabilities import Probabilities
-from .proposals import Guide, Proposal
+from .proposals import Guide
+from .screening import N_SCREENED, Announce, improved, proposals_of, screened
 from .unused import Uses
 
-N_SCREENED = 25  # points of every sub-model
-REACH = 10.0  # nats below the most probable sub-model, beyond which one is left as it is
-N_PILOT, GOOD = 200, 0.25  # points that judge a proposal; effective points per point that suffice
-N_REFITS = 5
 FEWEST = 100  # points of a sub-model within reach
 LARGE, ENOUGH = 0.01, 1000  # such an influence, and the points of such a sub-model at least
 TARGET_SE, NOISY_SE = 0.005, 0.01  # of an inclusion; with likelihoods that are estimates
 N_ROUNDS, MOST_POINTS = 6, 50_000  # of points that are added to reach it
-
-Announce = Callable[[str, int], None]
 
 
 def estimate_all(
@@ -44,9 +39,8 @@ def estimate_all(
     log_prior = prior.log_weight(sets)
     announce("all sub-models", N_SCREENED * len(sets))
     proposals = proposals_of(sets, guide, uses, sampler)
-    found = sampler.draw(proposals, [N_SCREENED] * len(sets))
+    found, chosen = screened(proposals, log_prior, sampler, rng)
     check_finite(found, candidates)
-    chosen = _within_reach(found, log_prior)
     found = [one if chosen[i] else one.without_points() for i, one in enumerate(found)]
     within = np.flatnonzero(chosen)
     pilots = improved([found[i].proposal for i in within], sampler, rng, announce)
@@ -61,48 +55,6 @@ def estimate_all(
         found[i] = one
     found = _with_lighter_tails(found, sets, log_prior, sampler, rng, announce)
     return until_certain(found, sets, log_prior, sampler, announce)
-
-
-def proposals_of(sets: Sets, guide: Guide, uses: Uses, sampler: Sampler) -> list[Proposal]:
-    """The proposals of sub-models, with unused variables where there are some."""
-    unused = [uses.unused(one) for one in sets]
-    found = [guide.proposal(one, blocks) for one, blocks in zip(sets, unused, strict=True)]
-    doubtful = [i for i, one in enumerate(found) if one.unused.size]
-    if doubtful:
-        is_free = sampler.is_free([found[i] for i in doubtful])
-        for i in np.compress(~is_free, doubtful):
-            found[i] = guide.proposal(sets[i], np.zeros_like(unused[i]))
-    return found
-
-
-def _within_reach(found: Sequence[Weighted], log_prior: Array) -> np.ndarray:
-    height = log_prior + [one.mean.value for one in found]
-    return np.asarray(height > height.max() - REACH)
-
-
-def improved(
-    proposals: Sequence[Proposal], sampler: Sampler, rng: np.random.Generator, announce: Announce
-) -> list[Weighted]:
-    """Proposals that are fitted again until they are good, each with the points that judged it."""
-    current = list(proposals)
-    best: dict[int, Weighted] = {}
-    before: list[list[Weighted]] = [[] for _ in current]
-    pending = list(range(len(current)))
-    for _ in range(N_REFITS + 1):
-        announce("proposals", N_PILOT * len(pending))
-        drawn = sampler.draw([current[i] for i in pending], [N_PILOT] * len(pending))
-        poor = []
-        for i, one in zip(pending, drawn, strict=True):
-            if i not in best or one.efficiency > best[i].efficiency:
-                best[i] = one
-            if one.efficiency < GOOD:
-                current[i] = one.refitted(rng, before[i])
-                before[i].append(one)
-                poor.append(i)
-        pending = [i for i in poor if current[i] is not before[i][-1].proposal]
-        if not pending:
-            break
-    return [best[i] for i in range(len(current))]
 
 
 def probabilities(found: Sequence[Weighted], sets: Sets, log_prior: Array) -> Probabilities:

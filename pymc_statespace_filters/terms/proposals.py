@@ -10,6 +10,7 @@ out. A wide part bounds the weights in the tails. Whatever is fitted is a proper
 density: it decides the error of an evidence, and not its mean.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -88,10 +89,13 @@ class Proposal:
 class Guide:
     """The posterior of the full model, as proposals of its sub-models need it.
 
-    Attributes
+    Parameters
     ----------
+    density : SubmodelDensity
     draws : ndarray (n, k)
         Unconstrained.
+    values : ndarray (n, k)
+        The same as the variables have them; NaN for those whose transform changes shape.
 
     Raises
     ------
@@ -100,14 +104,11 @@ class Guide:
     """
 
     def __init__(
-        self, density: SubmodelDensity, idata: xr.DataTree, rng: np.random.Generator
+        self, density: SubmodelDensity, draws: Array, values: Array, rng: np.random.Generator
     ) -> None:
-        every = unconstrained_draws(idata, density.model)
-        thin = slice(None, None, -(-every.shape[0] * every.shape[1] // MOST_FITTED))
-        self.draws = every[:, thin].reshape(-1, every.shape[-1])
+        self.draws = draws
         self._density = density
         candidates = density.candidates.switches
-        values = _values_of(idata, density.model, thin)
         self._values = candidates.held_at(self.draws.shape[1])
         self._moments = values.mean(axis=0), values.std(axis=0)
         self._coordinates = fitted_coordinates(density, self.draws, values)
@@ -122,6 +123,28 @@ class Guide:
                 columns.append(scaled[:, column, None])
         self._mixture = _fitted(np.concatenate(columns, axis=1), rng)
         self._slopes = self._slopes_of_priors(y)
+
+    @classmethod
+    def of_draws(
+        cls, density: SubmodelDensity, idata: xr.DataTree, rng: np.random.Generator
+    ) -> "Guide":
+        """From the posterior group."""
+        every = unconstrained_draws(idata, density.model)
+        thin = slice(None, None, -(-every.shape[0] * every.shape[1] // MOST_FITTED))
+        posterior = {
+            rv.name: idata["posterior"][rv.name].transpose("chain", "draw", ...).values[:, thin]
+            for rv in density.model.free_RVs
+        }
+        flat = {name: np.concatenate(list(one)) for name, one in posterior.items()}
+        draws = every[:, thin].reshape(-1, every.shape[-1])
+        return cls(density, draws, _in_columns(flat, density.model), rng)
+
+    @classmethod
+    def of_points(cls, density: SubmodelDensity, x: Array, rng: np.random.Generator) -> "Guide":
+        """From points (n, k) of the full model."""
+        is_on = np.ones((len(x), len(density.candidates)), dtype=bool)
+        values = density.density.constrained(density.model.free_RVs)(x, is_on)
+        return cls(density, x, _in_columns(values, density.model), rng)
 
     @property
     def base(self) -> Array:
@@ -173,13 +196,15 @@ def _slope(x: Array, values: Array) -> Array:
     return np.asarray(np.linalg.solve(ridge, z.T @ (values - values.mean())) / scale)
 
 
-def _values_of(idata: xr.DataTree, model: pm.Model, thin: slice) -> Array:
-    """The draws (n, k) as the variables have them; NaN for those whose transform changes shape."""
-    posterior, start, parts = idata["posterior"], model.initial_point(), []
+def _in_columns(values: Mapping[str, np.ndarray], model: pm.Model) -> Array:
+    """Values (n, ...) of the free variables side by side, (n, k).
+
+    NaN for those whose transform changes shape.
+    """
+    start, parts = model.initial_point(), []
     for rv in model.free_RVs:
         size = start[model.rvs_to_values[rv].name].size
-        drawn = posterior[rv.name].transpose("chain", "draw", ...).values[:, thin]
-        flat = drawn.reshape(drawn.shape[0] * drawn.shape[1], -1)
+        flat = values[rv.name].reshape(len(values[rv.name]), -1)
         same = flat.shape[1] == size
         parts.append(flat if same else np.full((len(flat), size), np.nan))
     return np.concatenate(parts, axis=1, dtype=np.float64)

@@ -22,6 +22,7 @@ from .doubts import check_finite, doubts
 from .draws import averaged
 from .enumeration import estimate_all, probabilities, until_certain
 from .estimates import Sampler
+from .guidance import checked_guide
 from .inclusion import BETA_BINOMIAL, MOST_COUNTED, read_inclusion
 from .proposals import Guide
 from .result import as_datatree
@@ -159,10 +160,11 @@ def select_terms(
     like = posterior_group(idata)
     with COMPILATION:
         density = SubmodelDensity(model, candidates)
-        guide = Guide(density, idata, rng)
+        guide = Guide.of_draws(density, idata, rng)
         with row_progress(density.density.calls, enabled=progressbar) as announce:
             uses = find_uses(density, guide.draws, rng)
             sampler = Sampler(density, guide.base, prior_pool(density, uses, rng), rng)
+            guide, full = checked_guide(guide, density, uses, sampler, rng, announce)
             visits = None
             if prior.n_open <= MOST_COUNTED:
                 sets = prior.all_sets()
@@ -178,6 +180,6 @@ def select_terms(
         count = like.sizes["chain"] * like.sizes["draw"]
         drawn = averaged(points, found.of_models, count, rng)
         tree = as_datatree(found, points, prior.restriction(rng), visits, drawn, density, idata)
-    for doubt in doubts(found, points, candidates, visits):
+    for doubt in doubts(found, points, candidates, visits, full):
         warnings.warn(f"probabilities of terms: {doubt}", EvidenceWarning, stacklevel=2)
     return tree

@@ -50,18 +50,22 @@ def choose_mixture(posterior: Posterior, rng: np.random.Generator) -> StudentMix
     return final.with_defensive_component().affine(mean, chol)
 
 
-def flattened_copy(
-    x: Array, log_ratio: Array, rng: np.random.Generator, n_components: int = N_COMPONENTS
-) -> list[StudentMixture]:
-    """The fit to points x (m, k) weighted by a power of a ratio of densities, if there is one.
+def flattened(x: Array, log_ratio: Array, rng: np.random.Generator) -> Array:
+    """Points of x (m, k), drawn by a power of a ratio of densities, of which one is not zero.
 
     The power is the largest that leaves a fifth of the points.
     """
+    power = next_temperature(0.0, log_ratio, ESS_FRACTION)
+    return x[systematic(normalised(power * log_ratio), N_FLATTENED, rng)]
+
+
+def flattened_copy(
+    x: Array, log_ratio: Array, rng: np.random.Generator, n_components: int = N_COMPONENTS
+) -> list[StudentMixture]:
+    """The fit to `flattened` points, if there is one."""
     if not np.isfinite(log_ratio).any():
         return []
-    power = next_temperature(0.0, log_ratio, ESS_FRACTION)
-    chosen = x[systematic(normalised(power * log_ratio), N_FLATTENED, rng)]
-    if (copy := standardised(chosen)) is None:
+    if (copy := standardised(flattened(x, log_ratio, rng))) is None:
         return []
     mixture = fit_mixture(copy.z, place_components(copy.z, n_components, rng))
     return [mixture.affine(copy.mean, copy.chol)]

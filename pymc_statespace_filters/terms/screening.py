@@ -1,0 +1,106 @@
+"""The first points of sub-models: which are within reach, and better proposals of these.
+
+A proposal that follows from poor draws may miss its sub-model, so that few points tell nothing
+about the evidence but that it is not below what they have seen. Before a sub-model is left as it
+is, its proposal is fitted again, unless it would be out of reach by a generous bound.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .density import Array, Sets
+from .estimates import Sampler, Weighted
+from .proposals import Guide, Proposal
+from .unused import Uses
+
+N_SCREENED = 25  # points of every sub-model
+FEWEST_EFFECTIVE = 3.0  # of them, that say something about the evidence
+REACH = 10.0  # nats below the most probable sub-model, beyond which one is left as it is
+N_PILOT, GOOD = 200, 0.25  # points that judge a proposal; effective points per point that suffice
+N_REFITS = 5
+
+Announce = Callable[[str, int], None]
+
+
+def proposals_of(sets: Sets, guide: Guide, uses: Uses, sampler: Sampler) -> list[Proposal]:
+    """The proposals of sub-models, with unused variables where there are some."""
+    unused = [uses.unused(one) for one in sets]
+    found = [guide.proposal(one, blocks) for one, blocks in zip(sets, unused, strict=True)]
+    doubtful = [i for i, one in enumerate(found) if one.unused.size]
+    if doubtful:
+        is_free = sampler.is_free([found[i] for i in doubtful])
+        for i in np.compress(~is_free, doubtful):
+            found[i] = guide.proposal(sets[i], np.zeros_like(unused[i]))
+    return found
+
+
+def screened(
+    proposals: Sequence[Proposal],
+    log_prior: Array,
+    sampler: Sampler,
+    rng: np.random.Generator,
+    highest: float = -np.inf,
+) -> tuple[list[Weighted], NDArray[np.bool_]]:
+    """A few points of each sub-model, and whether it is within reach of the best (S,).
+
+    The height of the best is at least ``highest``.
+    """
+    found = sampler.draw(proposals, [N_SCREENED] * len(proposals))
+    for _ in range(N_REFITS):
+        within = _within_reach(found, log_prior, highest)
+        again = [i for i in np.flatnonzero(within) if is_worthless(found[i])]
+        if not again:
+            break
+        drawn = sampler.draw([found[i].refitted(rng) for i in again], [N_SCREENED] * len(again))
+        for i, one in zip(again, drawn, strict=True):
+            found[i] = one
+    return found, _within_reach(found, log_prior, highest)
+
+
+def is_worthless(points: Weighted) -> bool:
+    """Whether the weights are so few that they say nothing about an evidence but its order."""
+    return points.n_effective < FEWEST_EFFECTIVE
+
+
+def _within_reach(found: Sequence[Weighted], log_prior: Array, highest: float) -> NDArray[np.bool_]:
+    height = log_prior + [one.mean.value for one in found]
+    most = log_prior + [_at_most(one) for one in found]
+    return np.asarray(most > max(height.max(), highest) - REACH)
+
+
+def _at_most(points: Weighted) -> float:
+    """The log-evidence; where few weights decide it, what it may well be at most.
+
+    That is as far above the largest weight as this is above the middle one.
+    """
+    value, largest = points.mean.value, float(points.log_weights.max())
+    if not is_worthless(points) or largest == -np.inf:
+        return value
+    return value + largest - float(np.median(points.log_weights))
+
+
+def improved(
+    proposals: Sequence[Proposal], sampler: Sampler, rng: np.random.Generator, announce: Announce
+) -> list[Weighted]:
+    """Proposals that are fitted again until they are good, each with the points that judged it."""
+    current = list(proposals)
+    best: dict[int, Weighted] = {}
+    before: list[list[Weighted]] = [[] for _ in current]
+    pending = list(range(len(current)))
+    for _ in range(N_REFITS + 1):
+        announce("proposals", N_PILOT * len(pending))
+        drawn = sampler.draw([current[i] for i in pending], [N_PILOT] * len(pending))
+        poor = []
+        for i, one in zip(pending, drawn, strict=True):
+            if i not in best or one.efficiency > best[i].efficiency:
+                best[i] = one
+            if one.efficiency < GOOD:
+                current[i] = one.refitted(rng, before[i])
+                before[i].append(one)
+                poor.append(i)
+        pending = [i for i in poor if current[i] is not before[i][-1].proposal]
+        if not pending:
+            break
+    return [best[i] for i in range(len(current))]
