@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ..errors import ModelError
 from .candidates import Candidates
-from .estimates import Visits, Weighted
+from .estimates import LEAST_EFFECTIVE, Visits, Weighted
 from .probabilities import Probabilities
 
 MAX_SHARE = 0.01  # of the probability, in sub-models of unreliable evidence
@@ -59,8 +59,10 @@ def doubts(
     if share > MAX_SHARE:
         worst = int(np.argmax(np.where(poor, found.of_models, -1.0)))
         labels = np.array(candidates.labels)[found.present[worst]]
+        few = points[worst].n_effective < LEAST_EFFECTIVE
         yield (
-            f"sub-models with {share:.0%} of the probability have few effective points, such as "
+            f"sub-models with {share:.0%} of the probability have "
+            f"{'few effective points' if few else 'weights with a heavy tail'}, such as "
             f"that with {', '.join(labels) or 'none of the terms'} (Pareto k "
             f"{points[worst].pareto_k:.2f}, {points[worst].n_effective:.0f} "
             "effective points): give more draws of the full model as idata, or a filter with more "

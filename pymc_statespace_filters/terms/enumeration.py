@@ -1,8 +1,8 @@
 """All sub-models: evaluations go to those that matter, by successive halving.
 
 A few points of each say which sub-models are out of reach (`screening`). The proposals of the
-others are fitted again until their weights are good. Then points are added where they reduce the error of an
-inclusion most (Neyman 1934).
+others are fitted again until their weights are good. Then points are added where they reduce the
+error of an inclusion most (Neyman 1934).
 """
 
 from collections.abc import Sequence

@@ -27,6 +27,7 @@ from .density import Array, Point, Seeds, Sets, SubmodelDensity
 from .proposals import Proposal
 from .unused import same
 
+LEAST_EFFECTIVE = MIN_EFFECTIVE / 2  # points of a sub-model whose error can be believed
 LEAST_FOR_TAIL = 25  # weights to which a Pareto tail is fitted
 
 
@@ -78,7 +79,7 @@ class Weighted:
     def is_reliable(self) -> bool:
         """Whether the error of the mean can be believed."""
         is_light = self.pareto_k <= largest_good_k(self.count)
-        return is_light and self.n_effective >= MIN_EFFECTIVE / 2
+        return is_light and self.n_effective >= LEAST_EFFECTIVE
 
     def joined(self, more: "Weighted") -> "Weighted":
         """With more points of the same proposal."""

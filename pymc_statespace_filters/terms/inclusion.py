@@ -128,8 +128,8 @@ def _probabilities(candidates: Candidates, inclusion: Any) -> Array | None:
         return np.array([float(inclusion[key]) for key in candidates.keys])
     if not is_finite(inclusion) or not 0 < inclusion < 1:
         raise ModelError(
-            f"inclusion must be {BETA_BINOMIAL!r}, a probability between 0 and 1, or a dictionary "
-            f"from candidates to probabilities, got {inclusion!r}"
+            f"inclusion must be {BETA_BINOMIAL!r}, a probability strictly between 0 and 1, "
+            f"or a dictionary from candidates to probabilities, got {inclusion!r}"
         )
     return np.full(len(candidates), float(inclusion))
 

@@ -104,8 +104,9 @@ def select_terms(
     Warns
     -----
     EvidenceWarning
-        If sub-models that matter have few effective points, or if chains visit a term more or less
-        often than the sub-models that were met say.
+        If sub-models that matter have few effective points or weights with a heavy tail, if the
+        draws are not of this model's posterior and no better proposal was found, or if chains visit
+        a term more or less often than the sub-models that were met say.
 
     Notes
     -----

@@ -99,8 +99,9 @@ def _matters(
     noise = np.broadcast_to(seeds[None, :, None], (*shape, seeds.shape[1]))
     found = density.evaluate(Point(_flat(x), _flat(present), _flat(noise)))
     log_density, own = found.total.reshape(shape), found.own.reshape(*shape, n_blocks)
-    before = log_density[..., :1] - own[..., 0, :]
-    after = log_density[..., 1:] - np.diagonal(own[..., 1:, :], axis1=-2, axis2=-1)
+    with np.errstate(invalid="ignore"):  # of infinities, which tell nothing
+        before = log_density[..., :1] - own[..., 0, :]
+        after = log_density[..., 1:] - np.diagonal(own[..., 1:, :], axis1=-2, axis2=-1)
     return np.asarray((~same(before, after)).any(axis=1))
 
 
