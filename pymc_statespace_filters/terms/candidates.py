@@ -13,6 +13,7 @@ from ..pymc_model.inspection import element_names
 from ..pymc_model.prior import is_improper
 from ..pymc_model.switched_density import Switches
 from ..system.checks import is_finite
+from .support import support
 
 Key = str | tuple[str, ...]
 
@@ -79,6 +80,7 @@ def read_candidates(model: pm.Model, absent: Mapping[Any, Any]) -> Candidates:
         _check_proper(members, model)
         columns.append(np.array([names.index(name) for name in members]))
         values.append(_values(key, value, len(members)))
+        _check_support(members, values[-1], names, model)
     return Candidates(tuple(absent), Switches(tuple(columns), tuple(values)))
 
 
@@ -115,6 +117,22 @@ def _check_proper(members: tuple[str, ...], model: pm.Model) -> None:
                 f"the prior of {name!r} is improper or not normalised, and the probability of its "
                 f"term is proportional to an unknown number: give it a proper prior, such as "
                 f"pm.Normal({name!r}, ...)"
+            )
+
+
+def _check_support(
+    members: tuple[str, ...], values: NDArray[np.float64], names: list[str], model: pm.Model
+) -> None:
+    """Raise if a term vanishes where its prior has no density; the edge is no such place."""
+    for name, value in zip(members, values, strict=True):
+        own = name.partition("[")[0]
+        elements = [one for one in names if one.partition("[")[0] == own]
+        limits = support(model[own], model, len(elements))
+        lower, upper = (float(one[elements.index(name)]) for one in limits)
+        if not lower <= value <= upper:
+            raise ModelError(
+                f"absent must give a value of {name!r} that its prior permits, from {lower:g} to "
+                f"{upper:g}, got {value:g}"
             )
 
 

@@ -3,7 +3,9 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+import pymc as pm
 from numpy.typing import NDArray
+from pytensor.graph.traversal import ancestors
 
 from ..errors import ModelError
 from .candidates import Candidates
@@ -25,9 +27,10 @@ def check_finite(points: Sequence[Weighted], candidates: Candidates) -> None:
         if without.any() and not possible[without].any():
             values = candidates.switches.values[j].tolist()
             raise ModelError(
-                f"absent must give a value of {key!r} at which the likelihood is not zero, got "
-                f"{values[0] if isinstance(key, str) else tuple(values)}: the density is zero or "
-                "not finite at all points of all sub-models without it"
+                f"absent must give a value of {key!r} at which the model has a density, got "
+                f"{values[0] if isinstance(key, str) else tuple(values)}: the likelihood, or the "
+                "prior of a variable that depends on it, is zero or not finite at all points of "
+                "all sub-models without it"
             )
 
 
@@ -37,6 +40,21 @@ def unreliable(found: Probabilities, points: Sequence[Weighted]) -> NDArray[np.b
     for i in np.flatnonzero(poor).tolist():
         poor[i] = not points[i].is_reliable
     return np.asarray(poor)
+
+
+def doubts_of_potentials(model: pm.Model, candidates: Candidates) -> Iterator[str]:
+    """Which Potentials may belong to the priors of candidates."""
+    if not model.observed_RVs:
+        return  # They are the likelihood.
+    members = [(one,) if isinstance(one, str) else one for one in candidates.keys]
+    own = {model[name.partition("[")[0]] for names in members for name in names}
+    for potential in model.potentials:
+        if used := sorted(rv.name for rv in own & set(ancestors([potential]))):
+            yield (
+                f"the Potential {potential.name!r} uses {', '.join(used)}: where it is a part of "
+                "the prior, this is not normalised, and the probabilities of these terms are "
+                "proportional to an unknown number: give them a distribution that has the density"
+            )
 
 
 def doubts(

@@ -18,7 +18,7 @@ from ..system.checks import check_random_seed
 from .candidates import read_candidates
 from .chain import run_chains
 from .density import SubmodelDensity
-from .doubts import check_finite, doubts
+from .doubts import check_finite, doubts, doubts_of_potentials
 from .draws import averaged
 from .enumeration import estimate_all, probabilities, until_certain
 from .estimates import Sampler
@@ -105,8 +105,9 @@ def select_terms(
     -----
     EvidenceWarning
         If sub-models that matter have few effective points or weights with a heavy tail, if the
-        draws are not of this model's posterior and no better proposal was found, or if chains visit
-        a term more or less often than the sub-models that were met say.
+        draws are not of this model's posterior and no better proposal was found, if a
+        Potential may be a part of a candidate's prior, or if chains visit a term more or less often
+        than the sub-models that were met say.
 
     Notes
     -----
@@ -181,6 +182,10 @@ def select_terms(
         count = like.sizes["chain"] * like.sizes["draw"]
         drawn = averaged(points, found.of_models, count, rng)
         tree = as_datatree(found, points, prior.restriction(rng), visits, drawn, density, idata)
-    for doubt in doubts(found, points, candidates, visits, full):
+    reasons = [
+        *doubts_of_potentials(model, candidates),
+        *doubts(found, points, candidates, visits, full),
+    ]
+    for doubt in reasons:
         warnings.warn(f"probabilities of terms: {doubt}", EvidenceWarning, stacklevel=2)
     return tree

@@ -12,6 +12,7 @@ from scipy.special import betaln, logsumexp
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.terms import chain, enumeration
+from pymc_statespace_filters.terms.candidates import read_candidates
 from tests.terms.regression import Regression
 
 
@@ -231,7 +232,9 @@ def test_a_likelihood_that_is_not_finite_is_named():
     with pm.Model() as model:
         mu, sd = pm.Normal("mu", 0, 1), pm.Normal("sd", 1, 0.2)
         pm.Normal("y", mu, sd, observed=[0.5, 1.0])
-    with pytest.raises(ModelError, match="a value of 'sd' at which the likelihood is not zero"):
+    with pytest.raises(
+        ModelError, match="a value of 'sd' at which the model has a density, got 0.0"
+    ):
         psf.select_terms(model, {"sd": 0.0}, idata=draws_of(mu=0.7, sd=1), progressbar=False)
 
 
@@ -355,3 +358,23 @@ def test_chains_with_draws_of_another_law(monkeypatch):
     terms = selected(regression, model, idata=poor_draws(0.0, 3.0))["terms"]
     truth = regression.inclusion()
     assert (np.abs(terms["inclusion"] - truth) < 4 * terms["inclusion_se"] + 1e-3).all()
+
+
+def test_a_value_that_the_prior_excludes_is_refused():
+    with pm.Model() as model:
+        b, c = pm.Uniform("b", -3, 3, shape=2), pm.HalfNormal("c", 1)
+        pm.Normal("y", b.sum() + c, 1.0, observed=[0.5, 1.0])
+    with pytest.raises(ModelError, match=r"'b\[1\]' that its prior permits, from -3 to 3, got 5"):
+        psf.select_terms(model, {"b[1]": 5.0})
+    with pytest.raises(ModelError, match="'c' that its prior permits, from 0 to inf, got -1"):
+        psf.select_terms(model, {"c": -1.0})
+    read_candidates(model, {"b[0]": 3.0, "c": 0.0})  # on the edge
+
+
+def test_a_potential_of_a_candidate_is_doubted():
+    with pm.Model() as model:
+        b = pm.Normal("b", 0, 1)
+        pm.Potential("narrow", -8 * b**2)
+        pm.Normal("y", b, 1.0, observed=[0.5, 1.0])
+    with pytest.warns(EvidenceWarning, match="the Potential 'narrow' uses b"):
+        psf.select_terms(model, {"b": 0.0}, idata=draws_of(b=0.1), random_seed=1, progressbar=False)

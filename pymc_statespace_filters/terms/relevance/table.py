@@ -123,7 +123,8 @@ def _gain(best: Optimised, without: Optimised | None, names: Sequence[str]) -> d
 def _sentences(table: pd.DataFrame, evidence: float, error: float) -> Iterator[str]:
     """What the display says below the columns."""
     yield f"Log-evidence under these priors: {evidence:.2f} ± {error:.2f}."
-    if out := [str(name) for name in table.index[table["prior_sd"] == 0]]:
+    # With a negative gain the optimum was a local one, and is better without the term.
+    if out := [str(one) for one in table.index[(table["prior_sd"] == 0) | (table["gain"] < 0)]]:
         yield f"Irrelevant: {', '.join(out)}."
     for name, row in table.iterrows():
         if row["doubts"]:
