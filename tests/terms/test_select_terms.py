@@ -232,9 +232,7 @@ def test_a_likelihood_that_is_not_finite_is_named():
     with pm.Model() as model:
         mu, sd = pm.Normal("mu", 0, 1), pm.Normal("sd", 1, 0.2)
         pm.Normal("y", mu, sd, observed=[0.5, 1.0])
-    with pytest.raises(
-        ModelError, match="a value of 'sd' at which the model has a density, got 0.0"
-    ):
+    with pytest.raises(ModelError, match="a value of 'sd' at which the model has a density, got 0"):
         psf.select_terms(model, {"sd": 0.0}, idata=draws_of(mu=0.7, sd=1), progressbar=False)
 
 

@@ -1,6 +1,7 @@
 """Relevance of coefficients against a regression whose evidence is known."""
 
 import numpy as np
+import pandas as pd
 import pymc as pm
 import pytest
 import xarray as xr
@@ -11,6 +12,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.importance import normalised, systematic
 from pymc_statespace_filters.terms.relevance import weighed
+from pymc_statespace_filters.terms.relevance.table import _sentences
 from tests.systems import FREE
 
 N, SD, NAMES = 40, 0.5, ["b[0]", "b[1]", "b[2]"]
@@ -173,3 +175,9 @@ def test_a_rival_of_a_term_in_doubt_stays_open():
     assert table.loc[present, "rivals"] == absent
     assert table.loc[present, "gain"] < 6
     assert table.inclusion == {"b[0]": 0.5, "b[1]": 0.5}
+
+
+def test_a_term_of_negative_gain_reads_as_irrelevant():
+    columns = {"prior_sd": [1.0, 0.5, 0.0], "gain": [3.0, -0.2, 0.0], "doubts": ["", "", ""]}
+    sentences = _sentences(pd.DataFrame(columns, index=["a", "b", "c"]), -10.0, 0.1)
+    assert "Irrelevant: b, c." in sentences
