@@ -97,8 +97,8 @@ def chib_jeliazkov(
     Raises
     ------
     ModelError
-        If an argument is invalid, a free variable is discrete, the draws are too few or do not
-        vary, or chains of held noise have different seeds.
+        If an argument is invalid, a free variable is discrete, the draws are too few, do not
+        vary or are those of `select_terms`, or chains of held noise have different seeds.
     DataMismatchError
         If the draws lack free variables of the model, belong to another model or other data, or
         the likelihood estimates of the chain cannot be recovered.

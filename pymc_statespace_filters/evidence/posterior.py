@@ -21,7 +21,7 @@ from ..pymc_model.aligned_axes import records_of_rows
 from ..pymc_model.density import ModelDensity
 from ..pymc_model.filter_estimates import failures_at
 from ..pymc_model.inspection import scored_rows
-from ..pymc_model.posterior_draws import unconstrained_draws
+from ..pymc_model.posterior_draws import check_one_model, unconstrained_draws
 from ..pymc_model.prior import ModelPrior
 from ..pymc_model.random_variable import PanelRV
 
@@ -136,8 +136,10 @@ def build_posterior(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterio
     Raises
     ------
     ModelError, DataMismatchError
-        As `unconstrained_draws`; and if stored and recomputed log-densities disagree.
+        As `check_one_model` and `unconstrained_draws`; and if stored and recomputed log-densities
+        disagree.
     """
+    check_one_model(idata)
     draws = unconstrained_draws(idata, density.model)
     stats = idata["sample_stats"].to_dataset() if "sample_stats" in idata.children else xr.Dataset()
     lacking = [f"{name}_seed" for name in density.seed_names if f"{name}_seed" not in stats]

@@ -63,9 +63,10 @@ def extend(
     Returns
     -------
     xarray.DataTree
-        As that of `sample_smc`, of all rows. States and forecasts at its draws need a model of all
-        rows. The filter is not checked again: ``attrs["filter_check"]`` keeps that it was found to
-        be off, and drops that there was no sign of it in the rows before.
+        As that of `sample_smc`, of all rows. States, forecasts and evidence from its draws need a
+        model of all rows, and refuse another one. The filter is not checked again:
+        ``attrs["filter_check"]`` keeps that it was found to be off, and drops that there was no
+        sign of it in the rows before.
 
     Raises
     ------

@@ -20,7 +20,7 @@ from ..filters.protocol import Filter
 from ..importance import normalised
 from ..pymc_model.held_seed import INSIDE
 from ..pymc_model.inspection import exactness, filters_used, noise_seeds
-from ..pymc_model.other_filter import BY_PARTICLES
+from ..pymc_model.posterior_draws import BY_PARTICLES
 from ..pymc_model.prior import Support
 from ..sampling.output.datatree import to_datatree
 from ..sampling.output.deterministics import Deterministics

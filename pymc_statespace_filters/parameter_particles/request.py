@@ -14,7 +14,7 @@ from ..filters.outcomes import why_zero
 from ..pymc_model.density import check_free_variables
 from ..pymc_model.filter_estimates import failures_at
 from ..pymc_model.fingerprint import FINGERPRINT_DIGITS, model_data_fingerprint, model_fingerprint
-from ..pymc_model.other_filter import BY_PARTICLES
+from ..pymc_model.posterior_draws import BY_PARTICLES
 from ..smc.bridge import Cloud
 from ..smc.moves import Size
 from ..smc.particles import Particles, Populations

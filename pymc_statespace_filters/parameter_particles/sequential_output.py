@@ -9,6 +9,7 @@ import xarray as xr
 from ..evidence.posterior import Observed
 from ..filters.recommendation import short_form
 from ..progress import stage_progress
+from ..pymc_model.posterior_draws import SEQUENTIAL
 from .observed_rows import ObservedRows
 from .output import COURSE, DoubtsOf, as_datatree
 from .request import Request
@@ -43,7 +44,7 @@ def finished(
         run,
         request,
         [_observed(rows)],
-        data="sequential",
+        data=SEQUENTIAL,
         seconds=perf_counter() - began,
         # With noise the largest of many estimates says nothing of the maximum.
         maximum=np.nan if rows.filter.noisy else float(likelihood.max()),

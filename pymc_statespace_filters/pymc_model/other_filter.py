@@ -14,9 +14,8 @@ from ..filters.protocol import Filter
 from ..filters.recommendation import check_system_and_filter
 from ..filters.written import filter_from
 from .inspection import filters_used, given_model, is_filter, state_space_nodes
+from .posterior_draws import BY_PARTICLES, check_same_rows
 from .random_variable import make_seed
-
-BY_PARTICLES = "smc"  # the attribute ``sampler`` of draws whose filter may not be the model's
 
 
 def model_with_filters(model: pm.Model, filters: Mapping[str, Filter]) -> pm.Model:
@@ -72,10 +71,16 @@ def model_of_draws(model: pm.Model | None, idata: Any) -> pm.Model:
     """The given model, with the filters by which draws of `sample_smc` were made.
 
     Those had another one inside, or more members at the end. A filter of a user's own class stays.
+
+    Raises
+    ------
+    DataMismatchError
+        If a sequential run has seen other data than those of the model.
     """
     model = given_model(model)
     if not isinstance(idata, xr.DataTree) or idata.attrs.get("sampler") != BY_PARTICLES:
         return model
+    check_same_rows(idata, model)
     used = json.loads(idata.attrs.get("filter", "{}"))
     own = json.loads(filters_used(model).get("filter", "{}"))
     filters = {

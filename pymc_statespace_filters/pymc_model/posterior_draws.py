@@ -10,7 +10,7 @@ import numpy as np
 import pymc as pm
 import pytensor
 import xarray as xr
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pymc.initial_point import make_initial_point_fn
 from pytensor.graph.replace import graph_replace
 
@@ -18,6 +18,10 @@ from ..compiler.native.rows import at_points
 from ..errors import DataMismatchError, ModelError
 
 MIN_DRAWS = 20
+# Values of the attribute ``sampler`` of draws.
+BY_PARTICLES = "smc"  # their filter may not be that of the model
+AVERAGED = "select_terms"  # over sub-models
+SEQUENTIAL = "sequential"  # of the attribute ``data`` of `BY_PARTICLES`, of a run that can go on
 
 
 def posterior_group(idata: xr.DataTree) -> xr.Dataset:
@@ -36,6 +40,47 @@ def posterior_group(idata: xr.DataTree) -> xr.Dataset:
             f"{sorted(map(str, posterior.dims))}: select one chain as isel(chain=[0])"
         )
     return posterior
+
+
+def check_one_model(idata: xr.DataTree) -> None:
+    """Raise a `ModelError` if draws are averaged over sub-models, and so have no one density."""
+    if isinstance(idata, xr.DataTree) and idata.attrs.get("sampler") == AVERAGED:
+        raise ModelError(
+            "idata must have draws of one model, got those of select_terms, which are averaged over"
+            " sub-models: the evidence of each of these is in idata['models']; for another result "
+            "of the full model, draw from it by psf.sample"
+        )
+
+
+def check_same_rows(idata: xr.DataTree, model: pm.Model) -> None:
+    """Raise a `DataMismatchError` if a sequential run has seen other observations than a model has.
+
+    `extend` makes its record longer than that of the model which the user has at hand. Other draws
+    may be used with other data. Missing rows may be NaN in one and left out in the other.
+    """
+    if idata.attrs.get("data") != SEQUENTIAL or "observed_data" not in idata.children:
+        return
+    for rv in model.observed_RVs:
+        if rv.name not in (record := idata["observed_data"]):
+            continue
+        own = _not_missing(model.rvs_to_values[rv].eval(mode="FAST_COMPILE"))
+        seen = _not_missing(record[rv.name].values)
+        if np.array_equal(seen, own, equal_nan=True):
+            continue
+        remedy = "go on with the others by psf.extend"
+        if len(own) <= len(seen):
+            remedy = "build the model with all rows of idata['observed_data']"
+        raise DataMismatchError(
+            f"model must have the rows of {rv.name!r} in idata: the draws were made with "
+            f"{len(seen)} rows that are not missing, and the model has "
+            f"{len(own) if len(own) != len(seen) else 'other values in them'}: {remedy}"
+        )
+
+
+def _not_missing(rows: ArrayLike) -> NDArray[np.float64]:
+    """The rows (J, p) of a record that are not entirely missing."""
+    values = np.asarray(rows, dtype=np.float64)
+    return values[~np.isnan(values).all(axis=-1)]
 
 
 def noise_was_moved(idata: xr.DataTree) -> bool:

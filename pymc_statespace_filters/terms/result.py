@@ -7,6 +7,7 @@ import xarray as xr
 
 from ..evidence.comparison.prior_sensitivity import width_factors
 from ..pymc_model.inspection import exactness, filters_used
+from ..pymc_model.posterior_draws import AVERAGED
 from .candidates import Candidates
 from .density import Sets, SubmodelDensity
 from .draws import Averaged, posterior_of
@@ -45,7 +46,8 @@ def as_datatree(
     }
     groups |= {name: idata[name].to_dataset() for name in COPIED if name in idata.children}
     tree = xr.DataTree.from_dict(groups)
-    tree.attrs |= filters_used(density.model) | {"exact": int(exactness(density.model))}
+    facts = {"exact": int(exactness(density.model)), "sampler": AVERAGED}
+    tree.attrs |= filters_used(density.model) | facts
     return tree
 
 

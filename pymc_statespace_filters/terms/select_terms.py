@@ -12,7 +12,7 @@ from ..compiler.native.compilation import COMPILATION
 from ..errors import EvidenceWarning
 from ..progress import row_progress
 from ..pymc_model.inspection import given_model
-from ..pymc_model.posterior_draws import posterior_group
+from ..pymc_model.posterior_draws import check_one_model, posterior_group
 from ..sampling import sample
 from ..system.checks import check_random_seed
 from .candidates import read_candidates
@@ -160,6 +160,7 @@ def select_terms(
         idata = sample(model=model, random_seed=rng, progressbar=progressbar)
     assert idata is not None, "draws on another rank"
     like = posterior_group(idata)
+    check_one_model(idata)
     with COMPILATION:
         density = SubmodelDensity(model, candidates)
         guide = Guide.of_draws(density, idata, rng)

@@ -4,9 +4,11 @@ import math
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.stats import norm
 from scipy.stats import t as student
 
+from pymc_statespace_filters.evidence.checks import check_convergence
 from pymc_statespace_filters.evidence.estimators.bridge import Bridge
 from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
 from pymc_statespace_filters.evidence.posterior import Posterior
@@ -55,6 +57,17 @@ def test_disagreement_is_named_from_an_r_hat():
     assert disagreement(terms) == ""
     assert disagreement(np.zeros((4, 500))) == ""
     assert "R-hat" in disagreement(terms + np.array([[0.0], [0.0], [0.0], [1.0]]))
+
+
+def test_populations_of_particles_are_no_chains():
+    """Their draws have common ancestors, and R-hat says nothing of them."""
+    draws = autoregressive((4, 100, 1), 0.5, np.random.default_rng(6))
+    draws += np.array([0.0, 0.5, 1.0, 1.5])[:, np.newaxis, np.newaxis]
+    posterior = Posterior(draws, norm.logpdf(draws[..., 0]), lambda x, rng: norm.logpdf(x[..., 0]))
+    of_chains, of_particles = xr.DataTree(), xr.DataTree()
+    of_particles.attrs["sampler"] = "smc"
+    assert "R-hat" in next(check_convergence(posterior, of_chains))
+    assert not list(check_convergence(posterior, of_particles))
 
 
 @pytest.mark.parametrize("estimator", [ChibJeliazkov(), Bridge()])

@@ -31,6 +31,15 @@ def by_filter():
     }
 
 
+@pytest.fixture(scope="module")
+def run_of_rows():
+    """A run of the first rows, and the same extended."""
+    short = model(psf.EKF(), 9)
+    first = psf.sample_smc(50, model=short, **SETTINGS)
+    more = {"observed": DATA[9:12], "steps": STEPS[9:12], "progressbar": False}
+    return {9: first, 12: psf.extend(first, short, **more)}
+
+
 @pytest.mark.parametrize("filter", [psf.EKF(), psf.BootstrapPF(6)])
 def test_evidences_scores_and_posterior_are_exact(by_filter, filter):
     """At each of 24 rows within 4.5 errors, of 10 populations, of quadrature."""
@@ -119,6 +128,37 @@ def test_states_and_forecasts_follow_from_the_draws(by_filter):
     found, built = by_filter[psf.EKF()].copy(), model(psf.EKF())
     ahead = psf.forecast(found, built, n_steps=2, n_draws=20, random_seed=1, progressbar=False)
     assert ahead["predictions"]["d"].sizes["d_time"] == 2
+
+
+@pytest.mark.parametrize(
+    "of_draws",
+    [
+        lambda *of: psf.forecast(*of, n_steps=2, random_seed=1, progressbar=False),
+        lambda *of: psf.filtered_states(*of, random_seed=1, progressbar=False),
+        lambda *of: psf.estimate_evidence(*of, random_seed=1, progressbar=False),
+        lambda *of: psf.check_filter(*of, random_seed=1, progressbar=False),
+    ],
+)
+@pytest.mark.parametrize(
+    ("n_seen", "n_own", "message"),
+    [
+        (12, 9, "made with 11 rows that are not missing, and the model has 8: build the model"),
+        (9, 12, "made with 8 rows that are not missing, and the model has 11: go on .* psf.extend"),
+    ],
+)
+def test_a_model_of_other_rows_is_refused(run_of_rows, of_draws, n_seen, n_own, message):
+    with pytest.raises(DataMismatchError, match=message):
+        of_draws(run_of_rows[n_seen], model(psf.EKF(), n_own))
+
+
+def test_a_model_of_the_same_or_of_other_values(run_of_rows):
+    """Rows that are left out are as good as missing ones."""
+    keep = ~np.isnan(DATA[:9, 0])
+    same = model(psf.EKF(), steps=STEPS[:9][keep], observed=DATA[:9][keep])
+    psf.filtered_states(run_of_rows[9], same, n_draws=2, random_seed=1, progressbar=False)
+    other = model(psf.EKF(), 9, observed=DATA[:9] + 1)
+    with pytest.raises(DataMismatchError, match="the model has other values in them: build"):
+        psf.filtered_states(run_of_rows[9], other, random_seed=1)
 
 
 @pytest.mark.parametrize("filter", [psf.EKF(), psf.BootstrapPF(6)])

@@ -11,6 +11,7 @@ from scipy.special import betaln, logsumexp
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
+from pymc_statespace_filters.evidence.evidence import Evidence, store_evidence
 from pymc_statespace_filters.terms import chain, enumeration
 from pymc_statespace_filters.terms.candidates import read_candidates
 from tests.terms.regression import Regression
@@ -114,6 +115,25 @@ def test_draws_are_averaged_over_sub_models():
     for name, one in zip(regression.absent, np.moveaxis(draws, -1, 0), strict=True):
         values = exact[name].values
         assert abs(one[full].mean() - values.mean()) < 5 * values.std() / full.sum() ** 0.5
+
+
+@pytest.mark.parametrize(
+    "of_draws",
+    [
+        psf.estimate_evidence,
+        psf.chib_jeliazkov,
+        lambda found, model: psf.reweight(found, model, filter=psf.BootstrapPF(10)),
+        lambda found, model: psf.drift_evidence(found, model, var_names="b3"),
+        lambda found, model: psf.relevance(found, model, ["b0"]),
+        lambda found, model: psf.prior_sensitivity({"m": found}, models={"m": model}),
+        lambda found, model: psf.select_terms(model, {"b0": 0.0}, idata=found),
+    ],
+)
+def test_averaged_draws_are_those_of_no_one_model(of_draws):
+    found = few_selected().copy()
+    store_evidence(found, Evidence(-30.0, 0.1, "bridge", 4, 20, -25.0, "data"), {})
+    with pytest.raises(ModelError, match=r"averaged over sub-models: .* in idata\['models'\]"):
+        of_draws(found, few_terms().model())
 
 
 def gap_model(observed):

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...errors import EvidenceWarning, ModelError
 from ...former_names import former_names
-from ...pymc_model.posterior_draws import unconstrained_draws
+from ...pymc_model.posterior_draws import check_one_model, unconstrained_draws
 from .compare import compare_evidence
 from .scaled_prior import ReweightedEvidence, WidthCurves, width_curves
 from .selection import EvidenceLike, check_ci_prob, probabilities
@@ -83,7 +83,8 @@ def prior_sensitivity(
     ------
     ModelError
         If an argument is invalid, or a prior cannot be scaled: it is improper, or the variable is
-        a probability, an angle, a simplex or a covariance.
+        a probability, an angle, a simplex or a covariance; or if draws are those of
+        `select_terms`.
     DataMismatchError
         If the models belong to different data, or the draws to another model.
 
@@ -195,6 +196,7 @@ def _width_curves(
     if unknown := [one for one in chosen if not any(one in of_model for of_model in free.values())]:
         raise ModelError(f"var_names must be free variables of the models, {free}, got {unknown}")
     for name in names:  # check that draws and model match
+        check_one_model(idatas[name])
         unconstrained_draws(idatas[name], models[name])
     return width_curves(
         models,

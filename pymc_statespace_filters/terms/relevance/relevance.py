@@ -16,7 +16,7 @@ from ...evidence.posterior import Posterior, check_overlap
 from ...importance import MIN_EFFECTIVE, normalised
 from ...progress import row_progress
 from ...pymc_model.inspection import given_model
-from ...pymc_model.posterior_draws import posterior_group, unconstrained_draws
+from ...pymc_model.posterior_draws import check_one_model, posterior_group, unconstrained_draws
 from ...system.checks import check_random_seed
 from .ard_evidence import ABSENT
 from .chosen_terms import ChosenTerms, chosen_terms
@@ -93,7 +93,8 @@ def relevance(
     Raises
     ------
     ModelError
-        If names are no coefficients with priors as above, if the draws are too few or do not vary.
+        If names are no coefficients with priors as above, if the draws are too few, do not
+        vary or are those of `select_terms`.
     DataMismatchError
         If the draws belong to another model or other data.
     TypeError
@@ -149,6 +150,7 @@ def relevance(
     """
     model, rng = given_model(model), check_random_seed(random_seed)
     posterior_group(idata)  # fails early, before anything is compiled
+    check_one_model(idata)
     terms = chosen_terms(model, names)
     with COMPILATION:
         density = TermDensity(terms)
