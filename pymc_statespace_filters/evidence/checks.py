@@ -32,7 +32,7 @@ from scipy.stats import rankdata
 
 from ..lower_chains import lower_chains
 from ..pymc_model.density import RowFunction
-from ..pymc_model.posterior_draws import BY_PARTICLES
+from ..pymc_model.posterior_draws import are_populations
 from ..pymc_model.step_refinement import densities_by_steps, step_stability
 from .posterior import Posterior, scalar_count
 
@@ -57,11 +57,8 @@ def check_convergence(posterior: Posterior, idata: xr.DataTree | None = None) ->
     As a rule of thumb, the effective sample size grows with the number of draws: the factor by
     which draws are missing is `ENOUGH_EFFECTIVE` over the smallest one, at least 2. More draws do
     not help where a chain stays far below another one. ``idata`` tells which sampler drew them.
-
-    The populations of `sample_smc` are no chains: their draws have common ancestors, so that R-hat
-    is large where the populations agree as well as independent ones can.
     """
-    if idata is not None and idata.attrs.get("sampler") == BY_PARTICLES:
+    if are_populations(idata):
         return
     parameters = np.moveaxis(posterior.draws, -1, 0)
     with np.errstate(invalid="ignore"):  # R-hat of a constant parameter is 0 / 0

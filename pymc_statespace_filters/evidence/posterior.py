@@ -5,7 +5,7 @@ Log-densities on the unconstrained space include the Jacobians of the transforms
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple, Protocol
@@ -21,7 +21,7 @@ from ..pymc_model.aligned_axes import records_of_rows
 from ..pymc_model.density import ModelDensity
 from ..pymc_model.filter_estimates import failures_at
 from ..pymc_model.inspection import scored_rows
-from ..pymc_model.posterior_draws import check_one_model, unconstrained_draws
+from ..pymc_model.posterior_draws import are_populations, check_one_model, unconstrained_draws
 from ..pymc_model.prior import ModelPrior
 from ..pymc_model.random_variable import PanelRV
 
@@ -62,6 +62,8 @@ class Posterior:
         ``failures(x)`` counts why the likelihood is zero at points x (m, k).
     prior : Prior, optional
         The likelihood is the log-density of `evaluate` minus that of the prior.
+    of_populations : bool
+        Whether the chains are populations of particles: see `are_populations`.
     shared_seed : tuple of int, optional
         Seed of the points whose log-densities several estimators use. Without it each estimator
         evaluates points of its own.
@@ -75,6 +77,7 @@ class Posterior:
     is_noisy: bool = False
     prior: Prior | None = None
     failures: Callable[[Array], Counter[Failure]] | None = None
+    of_populations: bool = False
     shared_seed: tuple[int, ...] | None = None
     shared: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
@@ -91,6 +94,10 @@ class Posterior:
         """
         log_prior = self.required_prior.log_density(x)
         return log_prior, log_likelihood_of(self.evaluate(x, rng), log_prior)
+
+    def worst_disagreement(self, found: Iterable[str]) -> list[str]:
+        """The worst of what chains disagree about, if they are chains; those that agree are ""."""
+        return [] if self.of_populations else sorted({one for one in found if one})[-1:]
 
     def why_zero(self, x: Array) -> str:
         """Why the likelihood is zero at most of some prior draws x (m, k), and what to do."""
@@ -176,7 +183,8 @@ def build_posterior(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterio
 
     prior = ModelPrior(density.model)
     failures = partial(failures_at, density.model)
-    return Posterior(draws, log_density, evaluate, not held, prior, failures), noise
+    facts = not held, prior, failures, are_populations(idata)
+    return Posterior(draws, log_density, evaluate, *facts), noise
 
 
 def reproducing_seeds(idata: xr.DataTree, density: ModelDensity) -> NDArray[np.int64] | None:

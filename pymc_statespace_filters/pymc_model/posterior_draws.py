@@ -42,6 +42,15 @@ def posterior_group(idata: xr.DataTree) -> xr.Dataset:
     return posterior
 
 
+def are_populations(idata: xr.DataTree | None) -> bool:
+    """Whether the chains are the populations of `sample_smc`, of which R-hat says nothing.
+
+    The draws of one have common ancestors, so that populations scatter more than chains with as
+    many draws; their scatter is the error.
+    """
+    return idata is not None and idata.attrs.get("sampler") == BY_PARTICLES
+
+
 def check_one_model(idata: xr.DataTree) -> None:
     """Raise a `ModelError` if draws are averaged over sub-models, and so have no one density."""
     if isinstance(idata, xr.DataTree) and idata.attrs.get("sampler") == AVERAGED:
@@ -60,8 +69,9 @@ def check_same_rows(idata: xr.DataTree, model: pm.Model) -> None:
     """
     if idata.attrs.get("data") != SEQUENTIAL or "observed_data" not in idata.children:
         return
+    record = idata["observed_data"].to_dataset()
     for rv in model.observed_RVs:
-        if rv.name not in (record := idata["observed_data"]):
+        if rv.name not in record:
             continue
         own = _not_missing(model.rvs_to_values[rv].eval(mode="FAST_COMPILE"))
         seen = _not_missing(record[rv.name].values)

@@ -23,7 +23,7 @@ from ...importance import (
 from ...progress import row_progress
 from ...pymc_model.density import ModelDensity
 from ...pymc_model.inspection import given_model
-from ...pymc_model.posterior_draws import noise_was_moved, posterior_group
+from ...pymc_model.posterior_draws import are_populations, noise_was_moved, posterior_group
 from ...system.checks import check_random_seed
 from ..checks import check_convergence
 from ..comparison.prior_sensitivity import width_factors
@@ -167,7 +167,7 @@ def drift_evidence(
     sets = [(name,) for name in names] + ([tuple(names)] if len(names) > 1 else [])
     log_terms, of_chains = _log_terms(idata, model, sets, rng, progressbar)
     means = {one: log_mean_of_chains(terms) for one, terms in log_terms.items()}
-    doubts = {one: [*_doubts(one, terms, means[one])] for one, terms in log_terms.items()}
+    doubts = {one: [*_doubts(one, terms, means[one], idata)] for one, terms in log_terms.items()}
     table = _table(log_terms, means, doubts, prior, ci_prob)
     for name, row in table.iterrows():
         if row["doubts"]:
@@ -204,7 +204,9 @@ def _log_terms(
     return found, list(check_convergence(posterior, idata))
 
 
-def _doubts(names: tuple[str, ...], log_terms: Array, mean: LogMean) -> Iterator[str]:
+def _doubts(
+    names: tuple[str, ...], log_terms: Array, mean: LogMean, idata: xr.DataTree
+) -> Iterator[str]:
     """Why the mean of the terms is unknown."""
     tail = pareto_k(log_terms)
     if mean.n_effective < MIN_EFFECTIVE or not tail <= largest_good_k(log_terms.size):
@@ -214,7 +216,7 @@ def _doubts(names: tuple[str, ...], log_terms: Array, mean: LogMean) -> Iterator
             f"{mean.n_effective:.0f} effective terms): draw more, or sample "
             f"pm.do(model, {{{zeros}}}) too and compare both by psf.compare_evidence"
         )
-    elif reason := disagreement(log_terms):
+    elif not are_populations(idata) and (reason := disagreement(log_terms)):
         yield reason
 
 

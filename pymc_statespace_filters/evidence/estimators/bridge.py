@@ -118,10 +118,13 @@ class Bridge:
             se_draws, se_proposals = _errors(folds)
             if is_small(self.target_se, se_draws, se_proposals):
                 break
-        return self._summary(folds, posterior.log_density.size, 2 * (n_proposals // 2))
+        return self._summary(folds, posterior, 2 * (n_proposals // 2))
 
-    def _summary(self, folds: Sequence["_Fold"], n_draws: int, n_proposals: int) -> Estimate:
+    def _summary(
+        self, folds: Sequence["_Fold"], posterior: Posterior, n_proposals: int
+    ) -> Estimate:
         """The average of both folds."""
+        n_draws = posterior.log_density.size
         se_draws, se_proposals = _errors(folds)
         se = math.hypot(se_draws, se_proposals)
         gap = abs(folds[0].log_evidence - folds[1].log_evidence) / (2 * se)
@@ -139,7 +142,7 @@ class Bridge:
             },
             doubts=(
                 *_check(n_effective, se_draws, se_proposals, gap),
-                *sorted({fold.disagreement for fold in folds if fold.disagreement})[-1:],
+                *posterior.worst_disagreement(fold.disagreement for fold in folds),
             ),
             shortfall=shortfall(
                 self.target_se,

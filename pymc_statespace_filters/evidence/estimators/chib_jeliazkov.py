@@ -127,7 +127,7 @@ class ChibJeliazkov:
                 )
                 for p, half in pairs
             ]
-            found = _of_one_block(single)
+            found = _of_one_block(single, posterior)
             se_draws = found.settings["n_effective_numerator"] ** -0.5
             se_proposals = found.settings["n_effective_denominator"] ** -0.5
         else:
@@ -243,7 +243,7 @@ def _choose_n_blocks(k: int, plans: Sequence[ProposalPlan]) -> int:
     return max(2, -(-k // BLOCK_SIZE))
 
 
-def _of_one_block(folds: Sequence[OneBlockEstimate]) -> Estimate:
+def _of_one_block(folds: Sequence[OneBlockEstimate], posterior: Posterior) -> Estimate:
     numerator = _effective(fold.numerator.n_effective for fold in folds)
     denominator = _effective(fold.denominator.n_effective for fold in folds)
     doubts = []
@@ -257,7 +257,7 @@ def _of_one_block(folds: Sequence[OneBlockEstimate]) -> Estimate:
             f"the proposals have an effective number of {denominator:.0f}, fewer than "
             f"{MIN_EFFECTIVE}: raise n_proposals, or reparametrise towards a Gaussian posterior"
         )
-    doubts += sorted({fold.disagreement for fold in folds if fold.disagreement})[-1:]
+    doubts += posterior.worst_disagreement(fold.disagreement for fold in folds)
     settings = {
         "n_blocks": 1,
         "scale": math.sqrt(folds[0].scale * folds[1].scale),
