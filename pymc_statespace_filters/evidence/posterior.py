@@ -146,7 +146,7 @@ def build_posterior(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterio
         As `check_one_model` and `unconstrained_draws`; and if stored and recomputed log-densities
         disagree.
     """
-    check_one_model(idata)
+    check_one_model(idata, density.model)
     draws = unconstrained_draws(idata, density.model)
     stats = idata["sample_stats"].to_dataset() if "sample_stats" in idata.children else xr.Dataset()
     lacking = [f"{name}_seed" for name in density.seed_names if f"{name}_seed" not in stats]

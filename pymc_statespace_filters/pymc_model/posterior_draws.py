@@ -51,14 +51,23 @@ def are_populations(idata: xr.DataTree | None) -> bool:
     return idata is not None and idata.attrs.get("sampler") == BY_PARTICLES
 
 
-def check_one_model(idata: xr.DataTree) -> None:
-    """Raise a `ModelError` if draws are averaged over sub-models, and so have no one density."""
+def check_one_model(idata: xr.DataTree, model: pm.Model) -> None:
+    """Raise unless the draws can be those of the posterior of a model.
+
+    Raises
+    ------
+    ModelError
+        If they are averaged over sub-models, and so have no one density.
+    DataMismatchError
+        As `check_same_rows`.
+    """
     if isinstance(idata, xr.DataTree) and idata.attrs.get("sampler") == AVERAGED:
         raise ModelError(
             "idata must have draws of one model, got those of select_terms, which are averaged over"
             " sub-models: the evidence of each of these is in idata['models']; for another result "
             "of the full model, draw from it by psf.sample"
         )
+    check_same_rows(idata, model)
 
 
 def check_same_rows(idata: xr.DataTree, model: pm.Model) -> None:

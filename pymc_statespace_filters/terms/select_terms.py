@@ -160,7 +160,7 @@ def select_terms(
         idata = sample(model=model, random_seed=rng, progressbar=progressbar)
     assert idata is not None, "draws on another rank"
     like = posterior_group(idata)
-    check_one_model(idata)
+    check_one_model(idata, model)
     with COMPILATION:
         density = SubmodelDensity(model, candidates)
         guide = Guide.of_draws(density, idata, rng)

@@ -196,7 +196,7 @@ def _width_curves(
     if unknown := [one for one in chosen if not any(one in of_model for of_model in free.values())]:
         raise ModelError(f"var_names must be free variables of the models, {free}, got {unknown}")
     for name in names:  # check that draws and model match
-        check_one_model(idatas[name])
+        check_one_model(idatas[name], models[name])
         unconstrained_draws(idatas[name], models[name])
     return width_curves(
         models,

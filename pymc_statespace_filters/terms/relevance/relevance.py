@@ -150,7 +150,7 @@ def relevance(
     """
     model, rng = given_model(model), check_random_seed(random_seed)
     posterior_group(idata)  # fails early, before anything is compiled
-    check_one_model(idata)
+    check_one_model(idata, model)
     terms = chosen_terms(model, names)
     with COMPILATION:
         density = TermDensity(terms)
