@@ -103,7 +103,6 @@ def run_models(
     >>> {name: tree["posterior"]["mu"].shape for name, tree in trees.items()}
     {'narrow': (4, 200), 'wide': (4, 200)}
     """
-    _check_models(models)
     if sampler not in _SAMPLERS:
         raise ModelError(f"sampler must be one of {tuple(_SAMPLERS)}, got {sampler!r}")
     name, known = _SAMPLERS[sampler]
@@ -112,6 +111,7 @@ def run_models(
             f"run_models() got an unexpected keyword argument {min(unknown)!r}: its settings are "
             f"those of {name}, without model"
         )
+    _check_models(models)
     folders = []
     if checkpoint is not None:
         folder = checked_folder(checkpoint)

@@ -69,8 +69,7 @@ class Failure(OutcomeCode):
         "or NaN, its noise has variance zero, or a parameter of its distribution is outside its "
         "domain, such as a negative mean of a Poisson distribution",
         "Write the observation so that it is defined at every state, for example with "
-        "pt.softplus(x[0]), which is positive and does not overflow; a sensor without noise takes "
-        "EKF() or UKF(), and a state that is not known exactly",
+        "pt.softplus(x[0]), which is positive and does not overflow",
     )
     INVALID_PROBABILITY = (
         12,

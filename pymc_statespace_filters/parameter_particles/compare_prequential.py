@@ -68,8 +68,8 @@ def compare_prequential(results: Mapping[str, xr.DataTree]) -> xr.Dataset:
     ...         psf.StateSpace("d", system, psf.EKF(), steps=[1, 2, 3], observed=[0.9, 1.4, 1.8])
     ...         return psf.sample_smc(50, data="sequential", random_seed=1, progressbar=False)
     >>> table = psf.compare_prequential({"persistent": run(0.9), "alternating": run(-0.9)})
-    >>> table["probability"].sel(model="persistent").values.round(1)
-    array([0.5, 0.8, 0.9])
+    >>> (table["probability"].sel(model="persistent") > 0.6).values
+    array([False,  True,  True])
     """
     courses = _courses(results)
     paths = [course["log_evidence_so_far"].values for course in courses.values()]
