@@ -17,7 +17,7 @@ from ..compiler.native.entry_point import address_of, cached_on_disk, call_addre
 from ..compiler.native.jit import copy_into
 from ..compiler.native.python_call import call_in_thread, call_machine_code
 from ..compiler.numerics.philox import generators_of_records
-from ..errors import ModelError, ModelWarning
+from ..errors import INSIDE, ModelError, ModelWarning
 from ..parallel.signals import held_interrupts
 from ..progress import slow_compilation
 from ..system.checks import check_flag, check_random_seed
@@ -354,7 +354,7 @@ def _warn_unless_finite(observations: np.ndarray, place: Callable[[int], str]) -
             f"first in row {row}, {place(row)}: the state overflows, or a covariance or a "
             "parameter of a distribution is none at these parameters. As data, NaN is missing.",
             ModelWarning,
-            skip_file_prefixes=(__file__,),
+            skip_file_prefixes=INSIDE,
         )
 
 
