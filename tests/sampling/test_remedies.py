@@ -11,13 +11,14 @@ RNG = np.random.default_rng(0)
 NORMAL = RNG.normal(size=4000)
 
 
-def drawn(stiffness, names=("stiffness", "other")):
-    """Unconstrained draws of a positive variable and of another one."""
+def drawn(stiffness, names=("stiffness", "other"), part=1.0):
+    """Unconstrained draws of a positive variable, and of another one that makes up for a part."""
     with pm.Model() as model:
         pm.HalfNormal("stiffness", 1)
         pm.Normal("other", 0, 1)
         pm.Normal("y", model["stiffness"] + model["other"], 1, observed=0.3)
-    return model, names, np.column_stack([np.log(stiffness), NORMAL])
+    other = RNG.normal(size=4000) - part * stiffness / stiffness.std()
+    return model, names, np.column_stack([np.log(stiffness), other])
 
 
 def test_a_posterior_that_reaches_zero():
@@ -30,6 +31,11 @@ def test_one_that_does_not():
     assert reaches_zero(*drawn(5 + NORMAL)) is None  # none of 4000 below zero
     assert reaches_zero(*drawn(np.exp(1.5 * NORMAL))) is None  # wide, and without density at zero
     assert reaches_zero(*drawn(RNG.gamma(3, size=4000))) is None
+
+
+def test_one_for_which_no_other_makes_up():
+    """As the common scale of a horseshoe, which no other transform would help."""
+    assert reaches_zero(*drawn(abs(NORMAL), part=0.0)) is None
 
 
 def test_the_scale_of_others_is_left_out():

@@ -15,6 +15,7 @@ from ...pymc_model.inspection import gradient_obstacle, kinked_variable, noisy_f
 # logarithms have this skewness: -1.1 with the exponential distribution, -1.5 with the half-normal,
 # zero with a lognormal one of any width.
 _LEAST_SHARE, _MOST_SKEWNESS = 0.01, -1.0
+_LEAST_CORRELATION = 0.5  # with another parameter, that can make up for it
 
 Array = NDArray[np.float64]
 
@@ -45,22 +46,30 @@ def without_transform(name: str) -> str:
 
 
 def reaches_zero(model: Model, names: Sequence[str], positions: Array) -> str | None:
-    """The positive variable whose posterior density at zero is largest, None if it is none.
+    """The positive variable that reaches zero and is most correlated with others, if there is one.
 
     On the scale of its logarithm such a posterior is bent: the tail towards zero goes along the
     logarithm alone, and the rest along all parameters that can make up for it. The scale of other
     variables is left out: near zero these lie close together on every scale.
     """
-    shares = {}
+    found = {}
     for i, name in enumerate(names):
-        rv = model[name.partition("[")[0]]
+        rv, log_x = model[name.partition("[")[0]], positions[:, i]
         if isinstance(model.rvs_to_transforms[rv], LogTransform) and not _is_parent(model, rv):
-            log_x = positions[:, i]
             x = np.exp(log_x - log_x.max())
-            near = float((x < 0.1 * x.mean()).mean())
-            if near > _LEAST_SHARE and skew(log_x) < _MOST_SKEWNESS:
-                shares[rv.name] = near
-    return max(shares, key=lambda name: shares[name], default=None)
+            is_near = float((x < 0.1 * x.mean()).mean()) > _LEAST_SHARE
+            if is_near and skew(log_x) < _MOST_SKEWNESS:
+                found[rv.name] = _largest_correlation(x, np.delete(positions, i, axis=1))
+    most = max(found, key=lambda name: found[name], default=None)
+    return most if most is not None and found[most] > _LEAST_CORRELATION else None
+
+
+def _largest_correlation(x: Array, others: Array) -> float:
+    """Of x (n,) with others (n, k), regardless of the sign."""
+    centred = others - others.mean(axis=0)
+    scale = np.maximum(centred.std(axis=0), np.finfo(float).tiny)
+    z = (x - x.mean()) / max(x.std(), np.finfo(float).tiny)
+    return float(np.abs(z @ (centred / scale) / len(x)).max(initial=0.0))
 
 
 def _is_parent(model: Model, rv: object) -> bool:
