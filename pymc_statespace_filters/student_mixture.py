@@ -8,7 +8,7 @@ the tails (Hesterberg 1995).
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -163,6 +163,31 @@ def place_components(x: Array, n_components: int, rng: np.random.Generator) -> S
     return StudentMixture(
         np.full(len(chosen), 1 / len(chosen)), np.stack(chosen), np.tile(scale, (len(chosen), 1, 1))
     )
+
+
+def likeliest_mixture(
+    first: Array,
+    second: Array,
+    numbers: Iterable[int],
+    rng: np.random.Generator,
+    *,
+    least_gain: float = 0.0,
+    degrees: float = DEGREES_OF_FREEDOM,
+) -> StudentMixture:
+    """The fit to standardised draws that makes other draws most probable.
+
+    Of these `numbers` of components, each is tried as long as it gains more than ``least_gain``
+    nats per draw of the second set. To fit all draws, start from the result.
+    """
+    best, highest = place_components(first, 1, rng), -np.inf
+    for n_components in numbers:
+        placed = place_components(first, n_components, rng)
+        fitted = fit_mixture(first, replace(placed, degrees=degrees))
+        held_out = float(fitted.log_density(second).mean())
+        if held_out <= highest + least_gain:
+            break
+        best, highest = fitted, held_out
+    return best
 
 
 def fit_mixture(x: Array, mixture: StudentMixture) -> StudentMixture:

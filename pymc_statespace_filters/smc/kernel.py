@@ -12,7 +12,7 @@ from ..student_mixture import (
     Standardised,
     StudentMixture,
     fit_mixture,
-    place_components,
+    likeliest_mixture,
     standardised,
 )
 from .particles import Evaluate, Particles, Populations
@@ -93,16 +93,8 @@ def _fitted_mixture(found: Standardised, rng: np.random.Generator) -> StudentMix
     first, second = np.array_split(found.z, 2)
     n, k = found.z.shape
     most = max(1, n // (2 * POINTS_OF_A_COMPONENT * k))
-    best, highest = place_components(first, 1, rng), -np.inf
-    for n_components in NUMBERS_OF_COMPONENTS:
-        if n_components > most:
-            break
-        fit = fit_mixture(first, place_components(first, n_components, rng))
-        score = float(fit.log_density(second).mean())
-        if score <= highest:
-            break
-        best, highest = fit, score
-    return fit_mixture(found.z, best)
+    numbers = [one for one in NUMBERS_OF_COMPONENTS if one <= most]
+    return fit_mixture(found.z, likeliest_mixture(first, second, numbers, rng))
 
 
 def metropolis(

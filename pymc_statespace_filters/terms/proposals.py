@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ..errors import ModelError
 from ..evidence.estimators.student_mixture import flattened_copy
 from ..pymc_model.posterior_draws import unconstrained_draws
-from ..student_mixture import StudentMixture, fit_mixture, place_components, standardised
+from ..student_mixture import StudentMixture, fit_mixture, likeliest_mixture, standardised
 from .coordinates import Coordinates, fitted_coordinates
 from .density import Array, Columns, Sets, SubmodelDensity
 
@@ -220,11 +220,6 @@ def _fitted(x: Array, rng: np.random.Generator) -> StudentMixture:
         )
     half = rng.permutation(len(x))
     first, second = found.z[half[::2]], found.z[half[1::2]]
-    best, reached = place_components(first, 1, rng), -np.inf
-    for n_components in range(1, MOST_COMPONENTS + 1):
-        fit = fit_mixture(first, place_components(first, n_components, rng))
-        score = float(fit.log_density(second).mean())
-        if score < reached + MIN_GAIN:
-            break
-        best, reached = fit, score
+    numbers = range(1, MOST_COMPONENTS + 1)
+    best = likeliest_mixture(first, second, numbers, rng, least_gain=MIN_GAIN)
     return fit_mixture(found.z, best).affine(found.mean, found.chol)

@@ -18,7 +18,7 @@ from ...student_mixture import (
     DEGREES_OF_FREEDOM,
     StudentMixture,
     fit_mixture,
-    place_components,
+    likeliest_mixture,
     standardised,
 )
 from .independence import (
@@ -124,13 +124,8 @@ def _likeliest(parts: Sequence[Array], rng: np.random.Generator) -> StudentMixtu
     """Fit the first halves of the parts with more and more components, compare on the second."""
     first = np.concatenate([part[: len(part) // 2] for part in parts])
     second = np.concatenate([part[len(part) // 2 :] for part in parts])
-    best, most = place_components(first, 1, rng), -np.inf
-    for n_components in range(1, MOST_COMPONENTS):
-        fitted = fit_mixture(first, place_components(first, n_components, rng))
-        held_out = float(fitted.log_density(second).mean())
-        if held_out < most + MIN_GAIN:
-            break
-        best, most = fitted, held_out
+    numbers = range(1, MOST_COMPONENTS)
+    best = likeliest_mixture(first, second, numbers, rng, least_gain=MIN_GAIN)
     return fit_mixture(np.concatenate(parts), best)
 
 

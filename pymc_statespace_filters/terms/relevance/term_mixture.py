@@ -6,7 +6,7 @@ it negative where the data say nothing; such eigenvalues become zero, so that no
 without bound.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from ...student_mixture import (
     WIDE_WEIGHT,
     StudentMixture,
     fit_mixture,
-    place_components,
+    likeliest_mixture,
     standardised,
 )
 from .ard_evidence import ABSENT, ArdEvidence
@@ -138,16 +138,6 @@ def fit_terms(
 def _chosen(z: Array, rng: np.random.Generator) -> StudentMixture:
     """The mixture of normals with which draws that it was not fitted to are most probable."""
     z = rng.permutation(z)
-    first, second = z[::2], z[1::2]
-    best, reached = _placed(first, 1, rng), -np.inf
-    for count in range(1, MOST_COMPONENTS + 1):
-        mixture = fit_mixture(first, _placed(first, count, rng))
-        held_out = float(mixture.log_density(second).mean())
-        if held_out < reached + MIN_GAIN:
-            break
-        best, reached = mixture, held_out
+    numbers = range(1, MOST_COMPONENTS + 1)
+    best = likeliest_mixture(z[::2], z[1::2], numbers, rng, least_gain=MIN_GAIN, degrees=NORMAL)
     return fit_mixture(z, best)
-
-
-def _placed(z: Array, count: int, rng: np.random.Generator) -> StudentMixture:
-    return replace(place_components(z, count, rng), degrees=NORMAL)
