@@ -352,7 +352,8 @@ def _warn_unless_finite(observations: np.ndarray, place: Callable[[int], str]) -
         warnings.warn(
             f"{failed.size} of {len(observations)} simulated observations are not finite, the "
             f"first in row {row}, {place(row)}: the state overflows, or a covariance or a "
-            "parameter of a distribution is none at these parameters. As data, NaN is missing.",
+            "parameter of a distribution is invalid at these parameters. A filter takes NaN for a "
+            "missing observation.",
             ModelWarning,
             skip_file_prefixes=INSIDE,
         )

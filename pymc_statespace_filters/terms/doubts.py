@@ -67,10 +67,10 @@ def doubts(
     """Why the errors of inclusions may be too small; ``full`` has points of the full model."""
     if full.n_effective < LEAST_OF_FULL:
         yield (
-            "idata seems to have no draws of the posterior of this model, or too few: of "
-            f"{full.count} points drawn like them {full.n_effective:.1f} are effective in the full "
-            "model, and no better proposal was found: give draws of the model, as sample does, or "
-            "a filter with more particles where the likelihood is noisy"
+            "the draws of idata do not seem to be from the posterior of this model, or are too "
+            f"few: {full.count} points that were drawn like them are worth {full.n_effective:.1f} "
+            "draws of the posterior, and no better proposal was found. Give draws of psf.sample, "
+            "or a filter with more particles where the likelihood is noisy"
         )
     poor = unreliable(found, points)
     share = float(found.of_models[poor].sum())

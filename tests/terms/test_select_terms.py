@@ -363,7 +363,7 @@ def test_draws_of_another_law_change_no_result(centre, width):
 def test_draws_from_which_nothing_is_found_are_doubted():
     regression = few_terms()
     model = regression.model(as_system=False)
-    with pytest.warns(EvidenceWarning, match="idata seems to have no draws of the posterior"):
+    with pytest.warns(EvidenceWarning, match="draws of idata do not seem to be from the posterior"):
         selected(regression, model, idata=poor_draws(500.0, 0.1))
 
 
