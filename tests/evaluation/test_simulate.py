@@ -257,7 +257,9 @@ def test_observations_that_are_not_finite_are_not_taken_for_missing_ones():
         initial_cov=[[0.0]],
     )
     at = {"steps": [0, 2, 9, 10, 12], "t0": 5.0, "random_seed": 1}
-    with pytest.warns(psf.errors.ModelWarning, match=r"^5 of 5 .* in row 0, at time 5.0: .* none"):
+    with pytest.warns(
+        psf.errors.ModelWarning, match=r"^5 of 5 .* in row 0, at time 5.0: .* invalid"
+    ):
         psf.simulate(system, {"v": -1.0, "start": 0.5}, **at)
     with pytest.warns(psf.errors.ModelWarning, match=r"^2 of 5 .* in row 3, at time 15.0: .* over"):
         psf.simulate(system, {"v": 1.0, "start": 3.0}, **at)
