@@ -40,6 +40,8 @@ def test_numbers():
     table = psf.compare_prequential(RIVALS)
     np.testing.assert_allclose(table["score_difference"].sel(model="two"), [-1.0, 1.0, 1.0])
     np.testing.assert_allclose(table["log_bayes_factor"].sel(model="two"), [-1.0, 0.0, 1.0])
+    np.testing.assert_allclose(table["score_difference_se"].sel(model="two"), np.hypot(0.1, 0.1))
+    assert (table["score_difference_se"].sel(model="one") == 0).all()
     odds = 1 / (1 + np.exp([1.0, 0.0, -1.0]))
     np.testing.assert_allclose(table["probability"].sel(model="two"), odds)
     np.testing.assert_allclose(table["probability_low"].sel(model="two"), odds)
