@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from pymc.distributions.transforms import _default_transform
 from pymc.logprob.transforms import LogTransform
 from scipy.stats import norm
 
@@ -57,11 +58,13 @@ def _scale_of_columns(density: SubmodelDensity) -> NDArray[np.str_]:
     model, kinds = density.model, np.full(len(density.blocks), "", dtype="<U6")
     held = density.candidates.switches.held_at(len(kinds))
     for column in np.concatenate(density.candidates.switches.columns):
-        transform = model.rvs_to_transforms[density.variables[column]]
-        if transform is None:
-            kinds[column] = "linear"
-        elif isinstance(transform, LogTransform) and held[column] == 0:
+        rv = density.variables[column]
+        transform, natural = model.rvs_to_transforms[rv], _default_transform(rv.owner.op, rv)
+        is_positive = isinstance(natural, LogTransform)
+        if isinstance(transform, LogTransform) and held[column] == 0:
             kinds[column] = "log"
+        elif transform is None and (natural is None or (is_positive and held[column] == 0)):
+            kinds[column] = "linear"
     return kinds
 
 
@@ -78,6 +81,8 @@ def _log_ratios(
     columns = np.flatnonzero(scale != "")
     blocks = density.blocks[columns]
     before, after = (density.priors.in_parts(at, present).own[:, blocks] for at in (x, moved))
+    # Points outside the support of a slab have no weight, whatever its width.
+    before = np.where(np.isneginf(before), 0.0, before)
     # The logarithm of a quantity has the factor 1 / w in its Jacobian already.
     ratio = after - before - np.log(width) * (scale[columns] == "linear")
     is_there = present[:, density.candidate_of[columns]]

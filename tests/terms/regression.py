@@ -112,12 +112,12 @@ class Regression:
             if b[-1] > 0:
                 return b
 
-    def model(self, *, as_system=True):
-        """The full model."""
+    def model(self, *, as_system=True, **of_last):
+        """The full model; ``of_last`` are settings of the half-normal coefficient."""
         with pm.Model() as model:
             tau = pm.HalfNormal("tau", 1) if self.slab_unknown else 1.0
             b = [pm.Normal(f"b{i}", 0, tau) for i in range(self.n_terms - 1)]
-            b.append(pm.HalfNormal(f"b{self.n_terms - 1}", tau))
+            b.append(pm.HalfNormal(f"b{self.n_terms - 1}", tau, **of_last))
             if as_system:
                 psf.StateSpace(
                     "y",

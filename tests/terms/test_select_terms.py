@@ -274,8 +274,14 @@ def test_elements_with_a_joint_density_are_refused():
         psf.select_terms(model, {"b": 0.0}, idata=draws_of(mu=0.7), progressbar=False)
 
 
-def test_slabs_of_other_widths():
-    regression, curves = few_terms(), few_selected()["widths"].to_dataset()
+@pytest.mark.parametrize("is_transformed", [True, False])
+def test_slabs_of_other_widths(is_transformed):
+    """Also of a positive coefficient without a transform, whose points may be negative."""
+    regression, found = few_terms(), few_selected()
+    if not is_transformed:
+        model = regression.model(as_system=False, default_transform=None)
+        found = selected(regression, model)
+    curves = found["widths"].to_dataset()
     size = regression.sets.sum(axis=1)
     for width in (0.25, 0.5, 1.0, 2.0, 4.0):
         evidence = [regression.log_evidence_given(one, width) for one in regression.sets]
