@@ -13,7 +13,9 @@ from pymc_statespace_filters.student_mixture import (
     StudentMixture,
     _m_step,
     fit_mixture,
+    likeliest_mixture,
     place_components,
+    standardised,
 )
 from tests.evidence.analytic import gaussian
 from tests.evidence.targets import Banana, TwoModes
@@ -105,3 +107,13 @@ def test_draws_that_do_not_vary():
     posterior.draws[..., 1] = 0.0
     with pytest.raises(ModelError, match="vary in every direction"):
         choose_mixture(posterior, rng)
+
+
+def test_as_many_components_as_held_out_draws_want():
+    """Two where there are two groups; one of a Student distribution, whatever else is tried."""
+    rng = np.random.default_rng(4)
+    groups = np.concatenate([rng.normal(-4.0, 1.0, 400), rng.normal(4.0, 1.0, 400)])
+    for draws, count in ((groups, 2), (rng.standard_t(5, 800), 1)):
+        z = standardised(rng.permutation(draws)[:, np.newaxis]).z
+        found = likeliest_mixture(z[::2], z[1::2], range(1, 6), rng, least_gain=0.02)
+        assert len(found.weights) == count
