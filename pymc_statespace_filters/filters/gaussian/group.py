@@ -14,6 +14,7 @@ from ...compiler.codegen.arguments import AlongArguments
 from ...compiler.native.entry_point import call_address
 from ...compiler.native.jit import inline_always, njit_internal
 from ...compiler.native.plan import RECORD
+from ...compiler.numerics.order import stable_order
 from ...system import panel_records as panel
 from ..calls import integers_at, reals_at, state_given
 from ..plan import PLAN
@@ -251,7 +252,7 @@ def records_of(call, machine):
     last = np.empty(n_records, np.int64)
     for i in range(n_records):
         last[i] = -rows[found[i, BEGIN] + found[i, N_ROWS] - 1, panel.STEP]
-    order = np.argsort(last, kind="mergesort")
+    order = stable_order(last)
     sorted = np.empty((n_records, N_OF_RECORD), np.int64)
     for i in range(n_records):
         for column in range(N_OF_RECORD):

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...compiler.native.jit import njit_internal
+from ...compiler.numerics.order import stable_order
 from ..observation_failures import observation_failure
 from ..outcomes import GRID_TOO_LARGE, NO_PROCESS_NOISE, NONE, STATE_NOT_FINITE, ZERO_DENSITY
 from ..plan import log_density, step_moments
@@ -278,7 +279,7 @@ def _verdict_on_step(mean, sd, relative):
 def _in_order(segments, n, total):
     """The first n segments in ascending order, with masses in the place of densities."""
     out = empty_segments(n)
-    order = np.argsort(segments.low[:n])
+    order = stable_order(segments.low[:n])
     whole = 0.0
     for p in range(n):
         q = order[p]
