@@ -106,14 +106,13 @@ def study(args: argparse.Namespace) -> pd.DataFrame:
     model = full_model(terms, record, shrunk=False)
     idata = psf.sample(model=model, **settings)
     seconds["draws"] = time.process_time() - began
-    elements = [f"{name}[{i}]" for name in TRUTH for i in range(len(terms))]
 
     began = time.process_time()
     relevant = psf.relevance(idata, model, list(TRUTH), **quiet)
     seconds["relevance"] = time.process_time() - began
 
     began = time.process_time()
-    selected = psf.select_terms(model, dict.fromkeys(elements, 0.0), idata=idata, **quiet)
+    selected = psf.select_terms(model, dict.fromkeys(TRUTH, 0.0), idata=idata, **quiet)
     seconds["select_terms"] = time.process_time() - began
 
     began = time.process_time()

@@ -1,6 +1,6 @@
 """The candidates: which scalars of a model vanish together, and at which values."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +9,7 @@ import pymc as pm
 from numpy.typing import NDArray
 
 from ..errors import ModelError
-from ..pymc_model.inspection import element_names
+from ..pymc_model.elements import Columns, Elements
 from ..pymc_model.prior import is_improper
 from ..pymc_model.switched_density import Switches
 from ..system.checks import is_finite
@@ -24,14 +24,17 @@ class Candidates:
 
     Attributes
     ----------
-    keys : tuple
-        As the user has named them: a scalar, or a tuple of scalars.
+    elements : Elements
+        Of the model.
     switches : Switches
         Their columns of the unconstrained vector, and the values at which they vanish.
+    keys : tuple
+        Their names: a scalar, or a tuple of scalars.
     """
 
-    keys: tuple[Key, ...]
+    elements: Elements
     switches: Switches
+    keys: tuple[Key, ...]
 
     def __len__(self) -> int:
         return len(self.keys)
@@ -39,21 +42,23 @@ class Candidates:
     @property
     def labels(self) -> list[str]:
         """Their names in results."""
-        return [label(key) for key in self.keys]
+        return [key if isinstance(key, str) else ", ".join(key) for key in self.keys]
 
-    def number(self, key: Any, argument: str) -> int:
-        """The number of the candidate that an argument names."""
-        if key not in self.keys:
+    @property
+    def variables(self) -> list[str]:
+        """The names of the free variables that they are of, in the order of the model."""
+        columns = np.sort(np.concatenate(self.switches.columns))
+        return list(dict.fromkeys(self.elements.variables[column] for column in columns))
+
+    def numbers(self, key: Any, argument: str) -> list[int]:
+        """The numbers of the candidates that an argument names: several for a whole vector."""
+        named = {one for of in _columns(key, self.elements, argument) for one in of}
+        found = [i for i, own in enumerate(self.switches.columns) if named.issuperset(own)]
+        if sum(len(self.switches.columns[i]) for i in found) < len(named):
             raise ModelError(
-                f"{argument} must name candidates, the keys of absent, {list(self.keys)}, got "
-                f"{key!r}"
+                f"{argument} must name candidates, those of absent, {list(self.keys)}, got {key!r}"
             )
-        return self.keys.index(key)
-
-
-def label(key: Key) -> str:
-    """The name of a candidate in results."""
-    return key if isinstance(key, str) else ", ".join(key)
+        return found
 
 
 def read_candidates(model: pm.Model, absent: Mapping[Any, Any]) -> Candidates:
@@ -63,55 +68,56 @@ def read_candidates(model: pm.Model, absent: Mapping[Any, Any]) -> Candidates:
             "absent must be a dictionary from candidates to the values at which they vanish, such "
             f"as {{'k3': 0.0}}, got {absent!r}"
         )
-    names = element_names(model)
+    elements = Elements.of(model)
     columns: list[NDArray[np.int64]] = []
     values: list[NDArray[np.float64]] = []
-    taken: dict[str, Key] = {}
+    taken: dict[int, Any] = {}
     for key, value in absent.items():
-        members = _members(key)
-        for name in members:
-            _check_name(name, names, model)
-            if name in taken:
-                raise ModelError(
-                    f"absent must name every scalar once, got {name!r} in {taken[name]!r} and in "
-                    f"{key!r}"
-                )
-            taken[name] = key
-        _check_proper(members, model)
-        columns.append(np.array([names.index(name) for name in members]))
-        values.append(_values(key, value, len(members)))
-        _check_support(members, values[-1], names, model)
-    return Candidates(tuple(absent), Switches(tuple(columns), tuple(values)))
+        for own, at in _terms(key, value, elements):
+            for column in own.tolist():
+                if column in taken:
+                    raise ModelError(
+                        f"absent must name every scalar once, got {elements.labels[column]!r} in "
+                        f"{taken[column]!r} and in {key!r}"
+                    )
+                taken[column] = key
+            columns.append(own)
+            values.append(at)
+    labels = [tuple(elements.labels[column] for column in own) for own in columns]
+    keys = tuple(own if len(own) > 1 else own[0] for own in labels)
+    candidates = Candidates(elements, Switches(tuple(columns), tuple(values)), keys)
+    _check_proper(candidates, model)
+    _check_support(candidates, model)
+    return candidates
 
 
-def _members(key: Any) -> tuple[str, ...]:
-    members = (key,) if isinstance(key, str) else key
-    is_tuple = isinstance(members, tuple) and bool(members)
-    if not is_tuple or not all(isinstance(name, str) for name in members):
-        raise ModelError(
-            f"absent must have names of scalars, or tuples of such names, as keys, got {key!r}"
-        )
-    return members
+def _terms(
+    key: Any, value: Any, elements: Elements
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
+    """Columns and values of the candidates of a key of ``absent``.
+
+    These are the elements of a vector, one by one; or all that a tuple names, together.
+    """
+    columns = _columns(key, elements, "absent")
+    own = np.array([one for of in columns for one in of])
+    at = _values(key, value, list(map(len, columns)))
+    if isinstance(key, tuple):
+        yield own, at
+    else:
+        yield from zip(own[:, None], at[:, None], strict=True)
 
 
-def _check_name(name: str, names: list[str], model: pm.Model) -> None:
-    if name in names:
-        return
-    if elements := [one for one in names if one.startswith(f"{name}[")]:
-        raise ModelError(
-            f"absent must name scalars, got {name!r} of {len(elements)} elements: name them one by "
-            f"one, {elements[0]!r} to {elements[-1]!r}, or a tuple of them that comes and goes "
-            "together"
-        )
-    kind = "no free variable" if name in model.named_vars else "unknown"
-    raise ModelError(
-        f"absent must name free variables of the model, or elements of them, got {name!r}, which "
-        f"is {kind}: the model has {names}"
-    )
+def _columns(key: Any, elements: Elements, argument: str) -> list[Columns]:
+    """The columns of each name in a key."""
+    names = (key,) if isinstance(key, str) else key
+    is_tuple = isinstance(names, tuple) and bool(names)
+    if not is_tuple or not all(isinstance(name, str) for name in names):
+        raise ModelError(f"{argument} must have names, or tuples of names, as keys, got {key!r}")
+    return [elements.columns(name, argument) for name in names]
 
 
-def _check_proper(members: tuple[str, ...], model: pm.Model) -> None:
-    for name in dict.fromkeys(one.partition("[")[0] for one in members):
+def _check_proper(candidates: Candidates, model: pm.Model) -> None:
+    for name in candidates.variables:
         if is_improper(model[name], model):
             raise ModelError(
                 f"the prior of {name!r} is improper or not normalised, and the probability of its "
@@ -120,28 +126,45 @@ def _check_proper(members: tuple[str, ...], model: pm.Model) -> None:
             )
 
 
-def _check_support(
-    members: tuple[str, ...], values: NDArray[np.float64], names: list[str], model: pm.Model
-) -> None:
+def _check_support(candidates: Candidates, model: pm.Model) -> None:
     """Raise if a term vanishes where its prior has no density; the edge is no such place."""
-    for name, value in zip(members, values, strict=True):
-        own = name.partition("[")[0]
-        elements = [one for one in names if one.partition("[")[0] == own]
-        limits = support(model[own], model, len(elements))
-        lower, upper = (float(one[elements.index(name)]) for one in limits)
+    elements, switches = candidates.elements, candidates.switches
+    limits = {name: _limits(name, elements, model) for name in candidates.variables}
+    columns, values = np.concatenate(switches.columns), np.concatenate(switches.values)
+    for column, value in zip(columns, values, strict=True):
+        lower, upper = limits[elements.variables[column]][column]
         if not lower <= value <= upper:
             raise ModelError(
-                f"absent must give a value of {name!r} that its prior permits, from {lower:g} to "
-                f"{upper:g}, got {value:g}"
+                f"absent must give a value of {elements.labels[column]!r} that its prior permits, "
+                f"from {lower:g} to {upper:g}, got {value:g}"
             )
 
 
-def _values(key: Key, value: Any, count: int) -> NDArray[np.float64]:
-    given = [value] if is_finite(value) else value
-    if isinstance(given, tuple | list | np.ndarray) and len(given) == count:
-        if all(is_finite(one) for one in given):
-            return np.array(given, dtype=float)
-    what = "a finite number" if count == 1 else f"{count} finite numbers"
+def _limits(name: str, elements: Elements, model: pm.Model) -> dict[int, tuple[float, float]]:
+    """The limits of a variable by column."""
+    columns = [i for i, of in enumerate(elements.variables) if of == name]
+    lower, upper = support(model[name], model, len(columns))
+    return dict(zip(columns, zip(lower, upper, strict=True), strict=True))
+
+
+def _values(key: Key, value: Any, sizes: list[int]) -> NDArray[np.float64]:
+    """The values of all scalars of a key, from one for each name, or for each of its elements."""
+    given = [value] if len(sizes) == 1 else value
+    if isinstance(given, tuple | list | np.ndarray) and len(given) == len(sizes):
+        flat = [_flat(one, size) for one, size in zip(given, sizes, strict=True)]
+        if all(len(one) == size for one, size in zip(flat, sizes, strict=True)):
+            return np.concatenate(flat).astype(float)
+    what = "a finite number" if len(sizes) == 1 else f"{len(sizes)} finite numbers"
+    elements = "" if max(sizes) == 1 else ", or as many as it has elements,"
     raise ModelError(
-        f"absent must give {what} for {key!r}, at which its term vanishes, got {value!r}"
+        f"absent must give {what}{elements} for {key!r}, at which its term vanishes, got {value!r}"
     )
+
+
+def _flat(value: Any, size: int) -> list[Any]:
+    """Finite numbers, a single one ``size`` times; empty if they are something else."""
+    flat = list(value.flat) if isinstance(value, np.ndarray) else value
+    flat = flat if isinstance(flat, tuple | list) else [flat]
+    if not all(is_finite(one) for one in flat):
+        return []
+    return list(flat) * (size if len(flat) == 1 else 1)

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
-from ..pymc_model.inspection import element_names
 from ..pymc_model.switched_density import DensityInParts, SwitchedDensity, SwitchedPriors
 from .candidates import Candidates
 
@@ -47,7 +46,7 @@ class SubmodelDensity:
     @cached_property
     def variables(self) -> list[TensorVariable]:
         """The free variable of every column."""
-        return [self.model[name.partition("[")[0]] for name in element_names(self.model)]
+        return [self.model[name] for name in self.candidates.elements.variables]
 
     @cached_property
     def scaled_columns(self) -> Columns:

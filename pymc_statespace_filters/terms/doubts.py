@@ -46,8 +46,7 @@ def doubts_of_potentials(model: pm.Model, candidates: Candidates) -> Iterator[st
     """Which Potentials may belong to the priors of candidates."""
     if not model.observed_RVs:
         return  # They are the likelihood.
-    members = [(one,) if isinstance(one, str) else one for one in candidates.keys]
-    own = {model[name.partition("[")[0]] for names in members for name in names}
+    own = {model[name] for name in candidates.variables}
     for potential in model.potentials:
         if used := sorted(rv.name for rv in own & set(ancestors([potential]))):
             yield (

@@ -119,19 +119,27 @@ def _probabilities(candidates: Candidates, inclusion: Any) -> Array | None:
     if isinstance(inclusion, str) and inclusion == BETA_BINOMIAL:
         return None
     if isinstance(inclusion, Mapping):
-        numbers = [candidates.number(key, "inclusion") for key in inclusion]
-        if missing := [key for i, key in enumerate(candidates.keys) if i not in numbers]:
-            raise ModelError(f"inclusion must have a probability for every candidate: {missing}")
-        for key, value in inclusion.items():
-            if not is_finite(value) or not 0 <= value <= 1:
-                raise ModelError(f"inclusion must be from 0 to 1 for {key!r}, got {value!r}")
-        return np.array([float(inclusion[key]) for key in candidates.keys])
+        return _probability_of_each(candidates, inclusion)
     if not is_finite(inclusion) or not 0 < inclusion < 1:
         raise ModelError(
             f"inclusion must be {BETA_BINOMIAL!r}, a probability strictly between 0 and 1, "
             f"or a dictionary from candidates to probabilities, got {inclusion!r}"
         )
     return np.full(len(candidates), float(inclusion))
+
+
+def _probability_of_each(candidates: Candidates, inclusion: Mapping[Any, Any]) -> Array:
+    found = np.full(len(candidates), np.nan)
+    for key, value in inclusion.items():
+        if not is_finite(value) or not 0 <= value <= 1:
+            raise ModelError(f"inclusion must be from 0 to 1 for {key!r}, got {value!r}")
+        numbers = candidates.numbers(key, "inclusion")
+        if not np.isnan(found[numbers]).all():
+            raise ModelError(f"inclusion must name every candidate once, got {key!r} again")
+        found[numbers] = value
+    if missing := [candidates.keys[i] for i in np.flatnonzero(np.isnan(found))]:
+        raise ModelError(f"inclusion must have a probability for every candidate: {missing}")
+    return found
 
 
 def _needed(candidates: Candidates, requires: Any) -> Sets:
@@ -144,9 +152,9 @@ def _needed(candidates: Candidates, requires: Any) -> Sets:
             f"considered, such as {{'k3': 'k1'}}, got {requires!r}"
         )
     for key, others in requires.items():
-        row = candidates.number(key, "requires")
+        rows = candidates.numbers(key, "requires")
         for other in _listed(others):
-            needed[row, candidates.number(other, "requires")] = True
+            needed[np.ix_(rows, candidates.numbers(other, "requires"))] = True
     if _closed(needed).diagonal().any():
         raise ModelError(
             f"requires must not lead from a candidate back to itself, got {requires!r}: what comes "

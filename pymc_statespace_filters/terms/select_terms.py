@@ -9,8 +9,10 @@ import pymc as pm
 import xarray as xr
 
 from ..compiler.native.compilation import COMPILATION
-from ..errors import EvidenceWarning
+from ..errors import INSIDE, EvidenceWarning
+from ..parallel.shared_rows import by_first_rank
 from ..progress import row_progress
+from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.inspection import given_model
 from ..pymc_model.posterior_draws import check_one_model, posterior_group
 from ..sampling import sample
@@ -29,6 +31,7 @@ from .result import as_datatree
 from .unused import find_uses, prior_pool
 
 
+@shared_by_ranks
 def select_terms(
     model: pm.Model,
     absent: Mapping[Any, Any],
@@ -38,6 +41,7 @@ def select_terms(
     requires: Mapping[Any, Any] | None = None,
     random_seed: int | np.random.Generator | None = None,
     progressbar: bool = True,
+    comm: Any = None,
 ) -> xr.DataTree:
     r"""Compute the probability of every term of an equation, from draws of the full model.
 
@@ -50,9 +54,10 @@ def select_terms(
     model : pymc.Model
         The full model, with continuous free variables; with any likelihood, with noise or without.
     absent : mapping
-        The candidates, and the values at which their terms vanish: a scalar variable ``"k3"``, an
-        element ``"b[3]"``, or a tuple of such names, with a tuple of values, for what comes and
-        goes together.
+        The candidates, and the values at which their terms vanish: a scalar variable ``"k3"``; an
+        element by its position or by the coordinates that the model gives it, ``"b[3]"`` or
+        ``"b[z^3]"``; ``"b"`` for each element of a vector; or a tuple of such names, with a tuple
+        of values, for what comes and goes together.
     idata : xarray.DataTree, optional
         Posterior draws of the full model, from any sampler. They say where to look, and not what
         the result is. Default: those of `sample`.
@@ -67,14 +72,20 @@ def select_terms(
     random_seed : int or numpy.random.Generator, optional
     progressbar : bool
         Whether to show a progress bar if the evaluations take more than two seconds.
+    comm : mpi4py.MPI.Comm, "world" or Ranks, optional
+        Ranks among which the evaluations are divided, as in `sample_dram`; the result does not
+        depend on their number. A rank whose ``idata`` is None gets that of the first, which makes
+        the draws if it has none.
 
     Returns
     -------
     xarray.DataTree
-        ``terms`` : along ``term``, the probability of ``inclusion``, its standard error
-        ``inclusion_se``, ``prior_inclusion``, and ``median_model``, the terms of a probability
-        above one half; ``pairs`` along ``term`` and ``term_other``, the probability that both are
-        present.
+        None on ranks that do not get it.
+
+        ``terms`` : along ``term``, with the labels of ArviZ, the probability of ``inclusion``, its
+        standard error ``inclusion_se``, ``prior_inclusion``, and ``median_model``, the terms of a
+        probability above one half; ``pairs`` along ``term`` and ``term_other``, the probability
+        that both are present.
 
         ``models`` : the sub-models along ``model``, most probable first, with what is ``present``
         along ``term``; ``probability`` with its error ``probability_se``, ``log_evidence`` with its
@@ -99,7 +110,9 @@ def select_terms(
         own, a value at which the likelihood is not finite, two candidates that switch off the same
         term.
     DataMismatchError
-        If the draws belong to another model.
+        If the draws belong to another model, or ranks differ in model, data or seed.
+    ParallelError
+        As `sample_dram`.
 
     Warns
     -----
@@ -157,7 +170,10 @@ def select_terms(
     prior = read_inclusion(candidates, inclusion, requires)
     rng = check_random_seed(random_seed)
     if idata is None:
-        idata = sample(model=model, random_seed=rng, progressbar=progressbar)
+        seed = int(rng.integers(2**63))
+        idata = by_first_rank(
+            lambda: sample(model=model, random_seed=seed, progressbar=progressbar)
+        )
     assert idata is not None, "draws on another rank"
     like = posterior_group(idata)
     check_one_model(idata, model)
@@ -188,5 +204,7 @@ def select_terms(
         *doubts(found, points, candidates, visits, full),
     ]
     for doubt in reasons:
-        warnings.warn(f"probabilities of terms: {doubt}", EvidenceWarning, stacklevel=2)
+        warnings.warn(
+            f"probabilities of terms: {doubt}", EvidenceWarning, skip_file_prefixes=INSIDE
+        )
     return tree

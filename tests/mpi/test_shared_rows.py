@@ -52,9 +52,10 @@ def results(idata, comm=None):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # few particles, and what few draws say
         particles = psf.sample_smc(model=built, comm=comm, **SEQUENTIAL)
+        terms = psf.select_terms(built, {"a": 0.0}, idata=idata, random_seed=3, **own)
         found = [call(idata, built, **own, **of_call) for call, of_call in calls.items()]
     evidence, reweighted, ahead, score = found
-    trees = {"particles": particles, "reweighted": reweighted, "ahead": ahead}
+    trees = {"particles": particles, "reweighted": reweighted, "ahead": ahead, "terms": terms}
     return {
         "evidence": repr(evidence),
         "score": score.elpd_i.values,

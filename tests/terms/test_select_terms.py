@@ -14,6 +14,7 @@ from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence.evidence import Evidence, store_evidence
 from pymc_statespace_filters.terms import chain, enumeration
 from pymc_statespace_filters.terms.candidates import read_candidates
+from pymc_statespace_filters.terms.inclusion import read_inclusion
 from tests.terms.regression import Regression
 
 
@@ -206,8 +207,8 @@ def test_states_of_averaged_draws():
     ("absent", "settings", "message"),
     [
         ({}, {}, "absent must be a dictionary"),
-        ({"k7": 0.0}, {}, "got 'k7', which is unknown"),
-        ({"y": 0.0}, {}, "got 'y', which is no free variable"),
+        ({"k7": 0.0}, {}, "free variables of the model, or elements of them, got 'k7'"),
+        ({"y": 0.0}, {}, "free variables of the model, or elements of them, got 'y'"),
         ({"b0": np.inf}, {}, "a finite number for 'b0', at which its term vanishes, got inf"),
         ({("b0", "b1"): 0.0}, {}, "2 finite numbers for"),
         ({"b0": 0.0, ("b0", "b1"): (0.0, 0.0)}, {}, "every scalar once, got 'b0'"),
@@ -216,6 +217,11 @@ def test_states_of_averaged_draws():
         ({"b0": 0.0}, {"inclusion": {"b0": 1.5}}, "from 0 to 1 for 'b0', got 1.5"),
         ({"b0": 0.0}, {"inclusion": {"b1": 0.5}}, "inclusion must name candidates"),
         ({"b0": 0.0, "b1": 0.0}, {"inclusion": {"b1": 0.5}}, "for every candidate"),
+        (
+            {"b0": 0.0},
+            {"inclusion": {"b0": 0.5, ("b0",): 0.3}},
+            "every candidate once, got .*b0.* again",
+        ),
         ({"b0": 0.0}, {"requires": {"b0": "b0"}}, "back to itself"),
         (
             {"b0": 0.0, "b1": 0.0},
@@ -270,8 +276,43 @@ def test_elements_with_a_joint_density_are_refused():
         pm.Normal("y", b.sum(), 1.0, observed=[0.5, 1.0])
     with pytest.raises(ModelError, match="an element of 'b', whose elements have a joint density"):
         psf.select_terms(model, {"b[0]": 0.0}, idata=draws_of(mu=0.7), progressbar=False)
-    with pytest.raises(ModelError, match="name them one by one"):
-        psf.select_terms(model, {"b": 0.0}, idata=draws_of(mu=0.7), progressbar=False)
+
+
+def vector_model():
+    """Three coefficients with labels, and one without."""
+    with pm.Model(coords={"term": ["z", "z^2", "z^3"]}) as model:
+        b, c = pm.Normal("b", 0, 1, dims="term"), pm.HalfNormal("c", 1)
+        pm.Normal("y", b.sum() + c, 1.0, observed=[0.5, 1.0])
+    return model
+
+
+@pytest.mark.parametrize(
+    ("absent", "keys", "columns", "values"),
+    [
+        ({"b": 0.0}, ("b[z]", "b[z^2]", "b[z^3]"), [[0], [1], [2]], [[0], [0], [0]]),
+        ({"b": [0, 0, 1]}, ("b[z]", "b[z^2]", "b[z^3]"), [[0], [1], [2]], [[0], [0], [1]]),
+        ({"b[z^3]": 0, "b[0]": 1}, ("b[z^3]", "b[z]"), [[2], [0]], [[0], [1]]),
+        ({("b",): 0}, (("b[z]", "b[z^2]", "b[z^3]"),), [[0, 1, 2]], [[0, 0, 0]]),
+        (
+            {("c", "b"): (2, 1)},
+            (("c", "b[z]", "b[z^2]", "b[z^3]"),),
+            [[3, 0, 1, 2]],
+            [[2, 1, 1, 1]],
+        ),
+    ],
+)
+def test_vectors_and_coordinates_name_candidates(absent, keys, columns, values):
+    found = read_candidates(vector_model(), absent)
+    assert found.keys == keys
+    assert [one.tolist() for one in found.switches.columns] == columns
+    assert [one.tolist() for one in found.switches.values] == values
+
+
+def test_a_vector_names_all_its_candidates():
+    candidates = read_candidates(vector_model(), {"b": 0.0, "c": 0.0})
+    prior = read_inclusion(candidates, {"b": 0.3, "c": 0.6}, {"b[z^3]": ["b[0]", "c"]})
+    np.testing.assert_array_equal(prior.probability, [0.3, 0.3, 0.3, 0.6])
+    np.testing.assert_array_equal(np.argwhere(prior.needed), [[2, 0], [2, 3]])
 
 
 @pytest.mark.parametrize("is_transformed", [True, False])

@@ -13,7 +13,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from ...errors import ModelError
 from ...evidence.comparison.scaled_prior import bounds_of_support
-from ...pymc_model.inspection import element_names
+from ...pymc_model.elements import Elements
 
 Array = NDArray[np.float64]
 
@@ -42,34 +42,24 @@ class ChosenTerms:
 
 def chosen_terms(model: pm.Model, names: str | Iterable[str]) -> ChosenTerms:
     """Check the argument ``names`` of `relevance`."""
-    every = element_names(model)
+    elements = Elements.of(model)
     given = list(dict.fromkeys([names] if isinstance(names, str) else names))
-    chosen = tuple(dict.fromkeys(one for name in given for one in _elements(name, every)))
+    chosen = list(dict.fromkeys(one for name in given for one in elements.columns(name, "names")))
     if not chosen:
-        raise ModelError(f"names must name at least one of {every}, got none")
-    variables = [rv for rv in model.free_RVs if any(_is_of(one, rv) for one in chosen)]
+        raise ModelError(f"names must name at least one of {list(elements.labels)}, got none")
+    of_chosen = {elements.variables[one] for one in chosen}
+    variables = [rv for rv in model.free_RVs if rv.name in of_chosen]
     for rv in variables:
         _check_prior(rv, model)
-    priors: dict[str, tuple[float, float]] = {}
+    priors: dict[int, tuple[float, float]] = {}
     for rv in variables:
-        labels = [one for one in every if _is_of(one, rv)]
-        priors |= dict(zip(labels, _normal_priors(rv, model), strict=True))
-    mean, precision = np.array([priors[name] for name in chosen]).T
+        columns = [one for one, name in enumerate(elements.variables) if name == rv.name]
+        priors |= dict(zip(columns, _normal_priors(rv, model), strict=True))
+    mean, precision = np.array([priors[one] for one in chosen]).T
+    labels = tuple(elements.labels[one] for one in chosen)
     plain = remove_value_transforms(model, variables)
-    places = element_names(plain)  # in another order
-    columns = np.array([places.index(name) for name in chosen])
-    return ChosenTerms(chosen, plain, columns, mean, precision)
-
-
-def _elements(name: object, every: list[str]) -> list[str]:
-    found = [one for one in every if one == name or one.startswith(f"{name}[")]
-    if not found:
-        raise ModelError(f"names must be free variables or elements of them, {every}, got {name!r}")
-    return found
-
-
-def _is_of(element: str, rv: TensorVariable) -> bool:
-    return element == rv.name or element.startswith(f"{rv.name}[")
+    places = Elements.of(plain).labels  # in another order
+    return ChosenTerms(labels, plain, np.array(list(map(places.index, labels))), mean, precision)
 
 
 def _check_prior(rv: TensorVariable, model: pm.Model) -> None:

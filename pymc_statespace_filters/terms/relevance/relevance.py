@@ -54,8 +54,9 @@ def relevance(
         This model; by default that of the ``with`` block.
     names : str or iterable of str
         Coefficients that are zero where their term is absent: free variables, or elements of them
-        such as ``"b[3]"``, with independent fixed priors on both sides of zero, normal or flat at
-        best. A variable of several elements stands for all of them.
+        such as ``"b[3]"`` or, by its coordinate, ``"b[z^3]"``, with independent fixed priors on
+        both sides of zero, normal or flat at best. A variable of several elements stands for all of
+        them.
     random_seed : int or numpy.random.Generator, optional
         Of the fit, of the points and of the noise of their likelihoods.
     progressbar : bool

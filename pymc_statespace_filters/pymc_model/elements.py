@@ -1,0 +1,98 @@
+"""The scalars of a model's free variables, by the names that users give them.
+
+An element of a vector is named by its position, ``"k[2]"``, or by the coordinates of its
+dimensions, ``"k[z^3]"``, as ArviZ labels it. The vector itself names all of them.
+"""
+
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pymc as pm
+
+from ..errors import ModelError
+
+Columns = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Elements:
+    """What the k columns of a model's unconstrained vector are called.
+
+    Attributes
+    ----------
+    labels : tuple of str
+        For every column: by coordinates where its dimensions have them, by position elsewhere.
+    variables : tuple of str
+        The variable of every column.
+    meanings : mapping
+        Names of variables and elements, each with all sets of columns that it may stand for.
+    """
+
+    labels: tuple[str, ...]
+    variables: tuple[str, ...]
+    meanings: Mapping[str, frozenset[Columns]]
+
+    @classmethod
+    def of(cls, model: pm.Model) -> "Elements":
+        """Those of a model."""
+        start = model.initial_point()
+        labels: list[str] = []
+        variables: list[str] = []
+        meanings: dict[str, set[Columns]] = defaultdict(set)
+        for rv in model.free_RVs:
+            shape = start[model.rvs_to_values[rv].name].shape
+            own, positions = _labels(rv.name, shape, model)
+            columns = range(len(labels), len(labels) + len(own))
+            meanings[rv.name].add(tuple(columns))
+            for column, *names in zip(columns, own, positions, strict=True):
+                for name in names:
+                    meanings[name].add((column,))
+            labels += own
+            variables += [rv.name] * len(own)
+        frozen = {name: frozenset(found) for name, found in meanings.items()}
+        return cls(tuple(labels), tuple(variables), frozen)
+
+    def columns(self, name: Any, argument: str) -> Columns:
+        """The columns that a name in an argument stands for.
+
+        Raises
+        ------
+        ModelError
+            If it is unknown, or stands for two elements.
+        """
+        found = self.meanings.get(name, frozenset())
+        if len(found) == 1:
+            return next(iter(found))
+        if found:
+            raise ModelError(
+                f"{argument} must name one element, got {name!r}, which is one by its position and "
+                "another by its coordinate: give the model coordinates that are no numbers"
+            )
+        own = str(name).partition("[")[0]
+        known = [label for label, of in zip(self.labels, self.variables, strict=True) if of == own]
+        what = f"{own!r} has {known}" if known else f"the model has {list(self.labels)}"
+        raise ModelError(
+            f"{argument} must name free variables of the model, or elements of them, got {name!r}: "
+            f"{what}"
+        )
+
+
+def _labels(name: str, shape: tuple[int, ...], model: pm.Model) -> tuple[list[str], list[str]]:
+    """Of the elements of a variable: the labels by coordinates, and those by position."""
+    dims = model.named_vars_to_dims.get(name) or (None,) * len(shape)
+    coords = [model.coords.get(dim) for dim in dims]
+    axes = [
+        range(n) if values is None or len(values) != n else values
+        for values, n in zip(coords, shape, strict=True)
+    ]
+    labels = [_label(name, one) for one in product(*axes)]
+    positions = [_label(name, one) for one in np.ndindex(shape)]
+    return labels if len(set(labels)) == len(labels) else positions, positions
+
+
+def _label(name: str, at: tuple[object, ...]) -> str:
+    return f"{name}[{', '.join(map(str, at))}]" if at else name
