@@ -11,6 +11,7 @@ import pandas as pd
 import pymc as pm
 from numpy.typing import NDArray
 from pymc.model import Model
+from scipy.optimize import linear_sum_assignment
 
 from ..errors import ModelError
 from ..evidence.estimators.newton import BatchFunction
@@ -41,6 +42,8 @@ STEP = 1e-3  # of the differences, in standard deviations of the population
 INVOLVED, INVOLVED_NOISY = 0.05, 0.5
 FAR, ROUNDING = (30.0, 40.0), 1e-6  # unconstrained, where a parameter is at its bound
 AT_BOUND = 0.02  # standard deviations of the population: smaller moves end at a bound
+# Maxima agree within these nats and standard errors; relative, of a parameter that has none.
+SAME_NATS, SAME_ERRORS, SAME_DIGITS = 0.005, 0.05, 1e-3
 
 
 def maximum_likelihood(
@@ -106,7 +109,8 @@ def maximum_likelihood(
     about 50 (k + 1)² for k parameters, the quadratics 4000 to 10 000.
 
     If the likelihood has several maxima, the largest need not be where the posterior has any mass;
-    it is then not found. Maxima less than two nats lower are named in the notes.
+    it is then not found. Maxima less than two nats lower are named in the notes, but not those
+    that have the same numbers in another order: labels exchanged, as of regimes.
 
     References
     ----------
@@ -208,18 +212,33 @@ def _described(
         covariance=pd.DataFrame(covariance, index=labels, columns=labels),
         unconstrained=peak.point,
         hessian=peak.hessian,
-        notes=(*peak.notes, *_notes_on_rivals(peak, values)),
+        notes=(*peak.notes, *_notes_on_rivals(peak, values, np.sqrt(np.diag(covariance)))),
         n_evaluations=n_evaluations,
     )
 
 
-def _notes_on_rivals(peak: Peak, values: ConstrainedValues) -> Iterator[str]:
+def _notes_on_rivals(peak: Peak, values: ConstrainedValues, errors: Array) -> Iterator[str]:
+    known = [(flattened(values(peak.point)), peak.value)]
     for point, value in peak.rivals:
+        flat = flattened(values(point))
+        if any(
+            abs(value - other) < SAME_NATS and _is_reordered(flat, numbers, errors)
+            for numbers, other in known
+        ):
+            continue
+        known.append((flat, value))
         named = ", ".join(
             f"{name} = {np.array2string(found, precision=4)}"
             for name, found in values(point).items()
         )
         yield f"another maximum, {peak.value - value:.2f} nats lower, is at {named}"
+
+
+def _is_reordered(one: Array, other: Array, errors: Array) -> bool:
+    """Whether two points (n,) have the same numbers in different places, within their errors."""
+    tolerance = np.where(np.isnan(errors), SAME_DIGITS * np.abs(other), SAME_ERRORS * errors)
+    differs = np.abs(one[:, None] - other) > np.maximum(tolerance[:, None], tolerance)
+    return not differs[linear_sum_assignment(differs)].any()
 
 
 class Errors(NamedTuple):

@@ -172,6 +172,18 @@ def test_another_maximum_as_high_is_reported():
     assert f"x = {-2.0 if found.estimate['x'] > 0 else 2.0:.0f}." in note
 
 
+def test_maxima_with_exchanged_labels_are_one():
+    """The prior may tell the labels apart: the likelihood does not."""
+    y = np.random.default_rng(1).normal(size=40) + np.repeat([-2.0, 2.0], 20)
+    with pm.Model() as model:
+        first, second = pm.Normal("first", 0.0, 5.0), pm.Normal("second", 1.0, 4.0)
+        likelihood = pt.logaddexp(-((y - first) ** 2) / 2.0, -((y - second) ** 2) / 2.0)
+        pm.Potential("likelihood", likelihood.sum())
+    found = psf.maximum_likelihood(model, random_seed=1)
+    assert abs(found.estimate["first"] - found.estimate["second"]) > 3.0
+    assert found.notes == ()
+
+
 def test_a_scale_of_zero_has_no_standard_error():
     """The data scatter less than their errors explain."""
     y = np.array([0.3, -0.5, 0.8, 0.1, -0.2, 0.4])
