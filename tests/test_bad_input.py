@@ -298,6 +298,12 @@ RECORDS = {
     "data too wide": (dict(observed=np.zeros((2, 2))), r"observed .*\(2, 1\).*\(2, 2\)"),
     "data infinite": (dict(observed=[0.0, np.inf]), r"observed .*NaN where missing.*inf"),
     "data words": (dict(observed=["a", "b"]), "observed must be numbers"),
+    "data complex": (dict(observed=[1.0, 1j]), "observed must be numbers, got .*1j"),
+    "dates in a column": (
+        dict(steps=None,
+             observed=pd.DataFrame({"day": pd.date_range("2020", periods=2), "z": [0.0, 1.0]})),
+        r"observed brings no dates.*its column 'day' has dates: \.set_index\('day'\)",
+    ),
     # parameters
     "parameter missing": (dict(params={}), r"no value for the parameters \['a'\]"),
     "parameter unknown": (dict(params={"a": 1.0, "b": 2.0}), r"parameters .*\['a'\], got \['b'\]"),
@@ -371,6 +377,15 @@ def test_a_wrong_simulation_is_refused(changes, words):
 def test_a_variable_has_a_name(name):
     with pm.Model(), pytest.raises(psf.errors.ModelError, match="name must be a text"):
         psf.StateSpace(name, SYSTEM, psf.EKF(), params={"a": 0.5}, steps=[0], observed=[0.0])
+
+
+def test_a_parameter_with_dims_is_given_by_element():
+    with pm.Model(coords={"site": ["a", "b"]}):
+        a = pm.Normal("a", dims="site")
+        said = r"'a' must have shape \(\), got \(\?,\): give one element, params=\{'a': \.\.\.\}"
+        with pytest.raises(psf.errors.ModelError, match=said):
+            psf.StateSpace("d", SYSTEM, psf.EKF(), steps=[0], observed=[0.0])
+        psf.StateSpace("d", SYSTEM, psf.EKF(), params={"a": a[0]}, steps=[0], observed=[0.0])
 
 
 def _skewed(b):

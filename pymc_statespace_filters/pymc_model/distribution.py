@@ -26,6 +26,7 @@ from ..system.timed_inputs import TimedInputs
 from . import dispatch as dispatch  # registers draw and density
 from .random_variable import NUMBERS, PanelRV, StateSpaceRV, make_seed
 from .record_dimensions import in_order_of_records
+from .unused_priors import warn_of_no_data
 
 
 class StateSpace(Continuous):
@@ -179,6 +180,7 @@ class StateSpace(Continuous):
         seed_array = check_seed("seed", seed)
         if seed_array.ndim:
             raise ModelError(f"seed must be one integer, got an array of shape {seed_array.shape}")
+        warn_of_no_data(name, record.observed)
         _add_coord(model, row_dim, row_coords, name)
         _add_coord(model, component_dim, list(system.observables), name)
         if panel is not None:

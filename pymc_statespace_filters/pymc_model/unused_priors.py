@@ -1,4 +1,4 @@
-"""The warning that a prior reaches no likelihood, as one whose name is misspelt does."""
+"""Warnings of priors that reach no data: a name is misspelt, or all data are missing."""
 
 import difflib
 import warnings
@@ -6,7 +6,9 @@ from collections.abc import Iterator
 from typing import Any
 from weakref import WeakKeyDictionary
 
+import numpy as np
 import pymc as pm
+from pytensor.graph.basic import Constant
 from pytensor.graph.traversal import ancestors
 
 from ..errors import ModelWarning
@@ -34,6 +36,17 @@ def warn_of_unused_priors(model: pm.Model) -> None:
         warnings.warn(
             f"the prior of {name!r} reaches no likelihood, so its posterior is the prior"
             + _probable_cause(name, fixed),
+            ModelWarning,
+            skip_file_prefixes=INSIDE,
+        )
+
+
+def warn_of_no_data(name: str, observed: Any) -> None:
+    """Warn if data that cannot be set later have no number."""
+    if isinstance(observed, Constant) and np.isnan(observed.data).all():
+        warnings.warn(
+            f"observed of {name!r} has no number, all of its {len(observed.data)} rows are missing "
+            "(NaN), so that the posterior is the prior",
             ModelWarning,
             skip_file_prefixes=INSIDE,
         )

@@ -73,6 +73,8 @@ def check_floats(name: str, value: Any, ndim: int | None, *, missing: bool = Fal
     try:
         if (objects := np.asarray(value)).dtype.kind == "O":
             value = np.where(pd.isna(objects), np.nan, objects)  # NA of pandas is no float
+        if objects.dtype.kind == "c":
+            raise TypeError  # numpy would leave out the imaginary parts
         # By rows, as compiled code reads it: the numbers of a DataFrame are stored by columns.
         array = np.array(value, dtype="float64", order="C")
     except (TypeError, ValueError):

@@ -77,11 +77,18 @@ class GivenRecord:
             raise ModelError(
                 "observed brings no dates: give steps or times, or dates as its index (read text "
                 "with pd.to_datetime, write index.to_timestamp() for periods), got the index "
-                f"{shortened(self.observed.index)}"
+                f"{shortened(self.observed.index)}{_column_of_dates(self.observed)}"
             )
         if found is None and self.observed is not None:
             raise ModelError("observed brings no dates: give steps or times")
         return found
+
+
+def _column_of_dates(table: pd.Series | pd.DataFrame) -> str:
+    """How a column of dates becomes the index, if a table has one."""
+    columns = [] if isinstance(table, pd.Series) else table.columns
+    names = [name for name in columns if are_dates(table[name])]
+    return f"; its column {names[0]!r} has dates: .set_index({names[0]!r})" if names else ""
 
 
 def _check_index(name: str, values: Any, observed: Any) -> None:

@@ -90,9 +90,13 @@ def _symbol(name: str, value: Any, shape: tuple[int, ...]) -> TensorVariable:
         s is None or s == e for s, e in zip(symbol.type.shape, shape, strict=False)
     )
     if not has_shape:
+        found = str(symbol.type.shape).replace("None", "?")
+        ways = (
+            f": give one element, params={{{name!r}: ...}}, declare shapes={{{name!r}: ...}} in "
+            "the system for an array, or name the records in panel= where each has its own"
+        )
         raise ModelError(
-            f"parameter {name!r} must have shape {shape}, got {symbol.type.shape}"
-            f"{'' if shape else ' (declare shapes={...} in the system for an array)'}"
+            f"parameter {name!r} must have shape {shape}, got {found}{'' if shape else ways}"
         )
     return pt.cast(symbol, "float64")
 

@@ -36,6 +36,13 @@ def test_a_misspelt_prior_is_named_with_the_default_that_is_used_instead():
     np.testing.assert_allclose(found.eval(at), pair_terms(0.5).sum(), rtol=1e-12)
 
 
+def test_data_without_a_number_are_named():
+    with pm.Model():
+        pm.Normal("a", 0.5, 0.2)
+        with pytest.warns(ModelWarning, match="observed of 'd' has no number, all of its"):
+            psf.StateSpace("d", PAIR, psf.EKF(), steps=STEPS, observed=np.nan * PAIR_DATA)
+
+
 def test_a_prior_with_a_reserved_name_is_named():
     with pytest.warns(ModelWarning, match=r"prior of 't' .*: 't' is the time .* never a parameter"):
         warn_of_unused_priors(model_with(lambda: pm.HalfNormal("t")))
