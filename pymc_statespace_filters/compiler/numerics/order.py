@@ -18,7 +18,7 @@ def stable_order(keys):
             middle, end = min(begin + width, n), min(begin + 2 * width, n)
             left, right = begin, middle
             for i in range(begin, end):
-                if right == end or left < middle and keys[order[left]] <= keys[order[right]]:
+                if right == end or (left < middle and keys[order[left]] <= keys[order[right]]):
                     merged[i] = order[left]
                     left += 1
                 else:
