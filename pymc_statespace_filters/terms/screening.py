@@ -71,12 +71,13 @@ def _within_reach(found: Sequence[Weighted], log_prior: Array, highest: float) -
 
 
 def _at_most(points: Weighted) -> float:
-    """The log-evidence; where few weights decide it, what it may well be at most.
+    """What the log-evidence may well be at most.
 
-    That is as far above the largest weight as this is above the middle one.
+    That is as far above its estimate as the largest weight is above the middle one: also points on
+    a slope, beside all that matters, may have weights that are not few.
     """
     value, largest = points.mean.value, float(points.log_weights.max())
-    if not is_worthless(points) or largest == -np.inf:
+    if largest == -np.inf:
         return value
     return value + largest - float(np.median(points.log_weights))
 

@@ -24,13 +24,15 @@ def test_no_sub_model_is_out_of_reach_by_points_that_say_nothing():
         np.zeros(25),
         np.full(25, -12.0),  # certainly out of reach
         np.linspace(-300.0, -12.0, 25),  # one point decides, and a better one may be missing
+        np.linspace(-20.0, -11.0, 25),  # five effective points, but on a slope
         np.linspace(-310.0, -300.0, 25),  # not that far
         np.full(25, -np.inf),
     ]
     found = [Weighted(None, np.empty((25, 0)), np.empty((25, 0), int), one) for one in weights]
-    within = screening._within_reach(found, np.zeros(5), -np.inf)
-    assert within.tolist() == [True, False, True, False, False]
-    assert not screening._within_reach(found, np.zeros(5), 1000.0).any()
+    within = screening._within_reach(found, np.zeros(6), -np.inf)
+    assert found[3].n_effective > screening.FEWEST_EFFECTIVE
+    assert within.tolist() == [True, False, True, True, False, False]
+    assert not screening._within_reach(found, np.zeros(6), 1000.0).any()
 
 
 def test_errors_of_probabilities_are_those_of_uncertain_evidences():
