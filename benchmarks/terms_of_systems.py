@@ -19,6 +19,8 @@ import logging
 import sys
 import time
 import warnings
+from dataclasses import replace
+from itertools import compress, product
 from pathlib import Path
 
 import numpy as np
@@ -118,26 +120,24 @@ def chain_density(x, present, record):
 
 def oscillator(seed):
     sys.path.insert(0, str(EXAMPLES / "thesis"))
-    from dataclasses import replace
-    from itertools import chain, combinations
-
-    from oscillator import CASES, NONLINEARITIES
+    from oscillator import CASES as RECORDS
     from oscillator_models import model_of
 
-    case = replace(CASES["case 3"], seed=532 + seed)
+    case = replace(RECORDS["case 3"], seed=532 + seed)
     absent = {"cubic": "k_nl", "freeplay": "slack", "hysteresis": "friction"}
-    terms, seconds = selected(model_of(case, psf.EKF()), dict.fromkeys(absent.values(), 0.0), seed)
-    began, found, sets = time.process_time(), [], []
-    for names in chain.from_iterable(combinations(NONLINEARITIES, size) for size in range(4)):
-        model = model_of(case, psf.EKF(), names)
-        idata = psf.sample_dram(
-            4000, tune=3000, model=model, random_seed=seed, until_ess=None,
-            kernel=psf.RandomWalkSettings(stages=(3, 1)), **QUIET,
-        )  # fmt: skip
-        found.append(psf.chib_jeliazkov(idata, model, random_seed=seed))
-        sets.append([name in names for name in absent])
-    evidence = [one.log_evidence for one in found]
-    other = by_evidence(np.array(sets), evidence, [one.se for one in found])
+    kernel = psf.RandomWalkSettings(stages=(3, 1))
+    full = model_of(case, psf.EKF())
+    terms, seconds = selected(full, dict.fromkeys(absent.values(), 0.0), seed, kernel=kernel)
+    began = time.process_time()
+    sets = np.array(list(product([False, True], repeat=len(absent))))
+    found = []
+    for present in sets:
+        model = model_of(case, psf.EKF(), compress(absent, present))
+        idata = psf.sample(model=model, random_seed=seed, kernel=kernel, **QUIET)
+        found.append(psf.chib_jeliazkov(idata, model, random_seed=seed, progressbar=False))
+    other = by_evidence(
+        sets, np.array([one.log_evidence for one in found]), np.array([one.se for one in found])
+    )
     return [True] * 3, terms, other, (seconds, time.process_time() - began)
 
 

@@ -13,8 +13,10 @@ degree three, ten for each equation; seven are there. The script compares
 * a regularised horseshoe (Piironen and Vehtari 2017), a prior that shrinks small coefficients,
   sampled by NUTS.
 
-and writes ``out/terms.csv``. ``--quick`` has the linear candidates only, three for each equation,
-and a hundred rows; the cubic term is then missing, as it may be in any library.
+and writes ``out/terms.csv``, with pictures of the probabilities, ``out/terms.png``, and of how they
+depend on the width of the priors, ``out/widths.png``. ``--quick`` has the linear candidates only,
+three for each equation, and a hundred rows; the cubic term is then missing, as it may be in any
+library.
 """
 
 import argparse
@@ -92,8 +94,8 @@ def horseshoe(name: str, scale: float = 0.1) -> None:
     pm.Deterministic(name, sd * pm.Normal(f"{name}_z", 0, 1, dims="term"), dims="term")
 
 
-def study(args: argparse.Namespace) -> pd.DataFrame:
-    """Run the three methods; return a table of the terms."""
+def study(args: argparse.Namespace) -> tuple[pd.DataFrame, xr.DataTree]:
+    """Run the three methods; return a table of the terms, and the result of `select_terms`."""
     terms = psf.mechanics.polynomial_terms(["v", "w"], args.degree)
     record = simulated(args.rows, args.seed)
     settings = {"draws": args.draws, "tune": args.draws, "sampler": "nuts", "chains": args.chains}
@@ -134,7 +136,7 @@ def study(args: argparse.Namespace) -> pd.DataFrame:
         index=[f"{name}: {term}" for name in TRUTH for term in terms.names],
     )
     table.attrs["seconds"] = seconds
-    return table
+    return table, selected
 
 
 def arguments(argv: list[str] | None = None) -> argparse.Namespace:
@@ -155,8 +157,11 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
 
 if __name__ == "__main__":
     given = arguments()
-    found = study(given)
+    found, selected = study(given)
     given.out.mkdir(parents=True, exist_ok=True)
     found.to_csv(given.out / "terms.csv")
+    psf.plot_terms(selected, backend="matplotlib").savefig(given.out / "terms.png")
+    widths = psf.plot_prior_sensitivity(selected["widths"].to_dataset(), backend="matplotlib")
+    widths.savefig(given.out / "widths.png")
     print(found.round(3).to_string())
     print("CPU seconds:", {name: round(one) for name, one in found.attrs["seconds"].items()})
