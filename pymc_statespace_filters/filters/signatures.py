@@ -24,8 +24,8 @@ class Form(NamedTuple):
 
 
 ONE_RECORD = Form("one record")
-POINTS = Form("points", ("theta", "terms", "health"))
-"""One record at many points: theta (B, k) -> terms (B, J), health (B, 3)."""
+POINTS = Form("points", ("theta", "terms", "health", "state"))
+"""One record at many points: theta (B, k), state (B, S) -> terms (B, J), health (B, 3)."""
 PANEL = Form("panel", ("theta", "steps", "theta_bar"))
 """All records of a panel, see `system.panel`: theta (G, k), rows (J, 3) -> terms (J,), health (3,).
 
@@ -62,6 +62,8 @@ RUN = Signature(
 (R, n), covariance (R, n, n), members (R, N, n) and weights (R, N); N is 0 without members."""
 RESUMED = Signature((*RUN.arguments, ("state", 1)), (*RUN.results, ("state", 1)))
 """From a state of the filter, empty at the start, with the state that it leaves."""
+GOING_ON = Signature((*RECORD, ("state", 1)), (_TERMS, _HEALTH, ("state", 1)))
+"""The likelihood of rows from a state of a deterministic filter, with the state that it leaves."""
 PREDICTIONS = Signature(
     SEEDED, (("predicted", 2), ("predicted_cov", 3), ("log_below", 2), ("log_above", 2))
 )

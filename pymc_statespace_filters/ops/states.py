@@ -1,9 +1,20 @@
 """States along a record, whole runs of a filter, and numbers behind terms: without a derivative."""
 
+from collections.abc import Sequence
+
+import numpy as np
+
 from ..compiler.lowering.compiled_system import CompiledSystem
 from ..compiler.native.plan import Plan
-from ..filters.protocol import Compiled, HealthFilter, PredictionFilter, RunFilter, StatesFilter
-from ..filters.signatures import PREDICTIONS, RESUMED, RUN, STATES, TERM_HEALTH
+from ..filters.protocol import (
+    BatchFilter,
+    Compiled,
+    HealthFilter,
+    PredictionFilter,
+    RunFilter,
+    StatesFilter,
+)
+from ..filters.signatures import GOING_ON, POINTS, PREDICTIONS, RESUMED, RUN, STATES, TERM_HEALTH
 from ..system.model import StateSpaceModel
 from .base import FilterOp
 
@@ -43,6 +54,29 @@ class ResumableRun(FilterRun):
     """`FilterRun` from a state of the filter, empty at the start, with the state that it leaves."""
 
     signature = RESUMED
+
+
+class GoingOn(FilterOp):
+    """Terms (B, J), health (B, 3) and states left (B, S) at many points, each from its own state.
+
+    The filter resumes at many points; without columns of states it starts.
+    """
+
+    signature = GOING_ON
+    filter: BatchFilter
+
+    def __init__(self, system: StateSpaceModel, filter: BatchFilter) -> None:
+        super().__init__(system, filter, POINTS)
+
+    def compile(self, system: CompiledSystem) -> Compiled | Plan:
+        """The filter at all points, side by side if it can."""
+        return self.filter.plan_of_many(system)
+
+    def n_steps(self, inputs: Sequence[np.ndarray]) -> int:
+        """Steps of an evaluation at all points."""
+        theta, steps, states = inputs[0], inputs[1], inputs[-1]
+        first = int(states[0, 0]) if states.size else 0
+        return (int(steps[-1]) - first) * len(theta) if steps.size else 0
 
 
 class TermHealth(FilterOp):

@@ -1,9 +1,11 @@
 """A filter at many points of a model, whose state is kept: one more row costs one update.
 
-Rows are evaluated at all points by machine code, in threads. A state is what
-`evaluation.run_filter` stores, so that a run that goes on has the bits of one run over all rows.
+Rows are evaluated at all points by machine code, in threads where that is worth it. A state is what
+`evaluation.run_filter` stores. A run that goes on has the bits of one run over all rows; points
+side by side may differ from a point alone in the last bit.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,16 +18,20 @@ from ..compiler.lowering.compiled_system import compile_system
 from ..compiler.native.planned_function import PlannedFunction
 from ..compiler.native.planned_rows import PlannedRow
 from ..compiler.native.rows import Rows, at_points
-from ..filters.protocol import Filter, ResumableFilter
+from ..filters.protocol import BatchFilter, Filter, ResumableFilter, properties
 from ..filters.signatures import RESUMED
 from ..filters.state_law import StateLaw
-from ..ops.base import kernel
-from ..ops.states import ResumableRun
+from ..ops.base import evaluator, kernel
+from ..ops.states import GoingOn, ResumableRun
+from ..parallel.shared_rows import evaluated_rows
+from ..parallel.threads import Pieces
 from ..system.model import StateSpaceModel
 
 _ARGUMENTS = [name for name, _ in RESUMED.arguments]
 _RESULTS = [name for name, _ in RESUMED.results]
 _KEPT = [_RESULTS.index("terms"), len(_RESULTS) - 1]  # and the state
+_PIECE_SECONDS = 0.02  # of one call of machine code, for whose end an interrupt waits
+_AT_ONCE = 8  # points, at least, of one call
 
 Array = NDArray[np.float64]
 
@@ -72,9 +78,12 @@ class FilterRows:
 
     def __init__(self, system: StateSpaceModel, filter: Filter) -> None:
         self.filter, self._system = filter, system
-        function = kernel(ResumableRun(system, filter))
-        assert isinstance(function, PlannedFunction)  # all filters that resume have a plan
-        self._function = function.loaded()
+        self._evaluate: _SideBySide | _OneByOne
+        if properties(filter).resumes_many:
+            assert isinstance(filter, BatchFilter)
+            self._evaluate = _SideBySide(system, filter)
+        else:
+            self._evaluate = _OneByOne(system, filter)
 
     def __call__(
         self,
@@ -87,6 +96,54 @@ class FilterRows:
 
         ``states`` (m, S) are those before the rows; of no columns where the rows are the first.
         """
+        return self._evaluate(theta, seeds, states, record)
+
+    def law_of_state(self, states: Array) -> StateLaw:
+        """The law of the system's state at the points, from what the filter has left."""
+        assert isinstance(self.filter, ResumableFilter)
+        return self.filter.law_of_state(compile_system(self._system), states)
+
+
+class _SideBySide:
+    """All points in one call of machine code, or in pieces that share the threads."""
+
+    def __init__(self, system: StateSpaceModel, filter: BatchFilter) -> None:
+        self._op = GoingOn(system, filter)
+        self._function, self._pieces = evaluator(self._op), Pieces(_PIECE_SECONDS, _AT_ONCE)
+
+    def __call__(
+        self, theta: Array, seeds: NDArray[np.int64], states: Array, record: Record
+    ) -> tuple[Array, Array]:
+        def at(points: slice) -> Sequence[Array]:
+            return self._at(theta[points], states[points], record)
+
+        def evaluate(points: slice) -> list[Array]:
+            given = [theta[points], *record, states[points]]
+            return self._pieces(at, points, self._op.n_steps(given))
+
+        def empty(m: int) -> list[Array]:
+            nothing = self._at(theta[:0], states[:0], record)
+            return [np.empty((m, part.shape[1])) for part in nothing]
+
+        terms, after = evaluated_rows(evaluate, [theta, states], empty)
+        return terms, after
+
+    def _at(self, theta: Array, states: Array, record: Record) -> tuple[Array, Array]:
+        terms, _, after = self._function(theta, *record, states)
+        return terms, after
+
+
+class _OneByOne:
+    """One point after the other in each thread, each with its own noise."""
+
+    def __init__(self, system: StateSpaceModel, filter: Filter) -> None:
+        function = kernel(ResumableRun(system, filter))
+        assert isinstance(function, PlannedFunction)  # all filters that resume have a plan
+        self._function = function.loaded()
+
+    def __call__(
+        self, theta: Array, seeds: NDArray[np.int64], states: Array, record: Record
+    ) -> tuple[Array, Array]:
         varying = {"theta": theta, "seed": seeds}
         given = {**record._asdict(), "wanted": np.empty(0, np.int64)}
         (varying if states.shape[1] else given)["state"] = (
@@ -98,8 +155,3 @@ class FilterRows:
         row = PlannedRow(self._function, [_ARGUMENTS.index(name) for name in order], example, _KEPT)
         terms, after = Rows(row, len(varying))(*varying.values())
         return terms, after
-
-    def law_of_state(self, states: Array) -> StateLaw:
-        """The law of the system's state at the points, from what the filter has left."""
-        assert isinstance(self.filter, ResumableFilter)
-        return self.filter.law_of_state(compile_system(self._system), states)

@@ -76,6 +76,7 @@ class RequestSlots(NamedTuple):
     number: int = 19
     state: int = 20  # of the filter after earlier rows, from which it goes on
     n_state: int = 21
+    n_before: int = 22  # states from which points go on, one each
 
 
 class ResultSlots(NamedTuple):
@@ -145,7 +146,7 @@ SHAPES: Mapping[str, tuple[str | int, ...]] = {
     "tape": ("n_tape", "tape_width"),
     "theta_bar": ("n_records", "n_theta"),
     "normals": ("n_normals",),
-    "state": ("n_state",),
+    "state": ("n_points", "n_state"),
 }
 """Shapes of the results; a caller that wants fewer dimensions leaves out the first."""
 
@@ -177,6 +178,7 @@ ARGUMENTS: Mapping[tuple[str, int], Argument] = {
     ("draw_seed", 0): _value(REQUEST.draw_seed),
     ("terms_bar", 1): Argument("request", REQUEST.terms_bar, (REQUEST.n_terms_bar,)),
     ("state", 1): Argument("request", REQUEST.state, (REQUEST.n_state,)),
+    ("state", 2): Argument("request", REQUEST.state, (REQUEST.n_before, REQUEST.n_state)),
     ("tape", 2): Argument("request", REQUEST.tape, (REQUEST.n_tape, REQUEST.tape_width)),
     ("rank", 0): _value(REQUEST.rank),
     ("n_ranks", 0): _value(REQUEST.n_ranks),
@@ -188,7 +190,7 @@ ARGUMENTS: Mapping[tuple[str, int], Argument] = {
 
 DEFAULTS = {
     "record": {RECORD.n_records: 1, RECORD.row_width: 1, RECORD.n_starts: 1},
-    "request": {REQUEST.n_ranks: 1},
+    "request": {REQUEST.n_ranks: 1, REQUEST.n_before: 1},
 }
 """Words that are not 0 where nothing is given."""
 

@@ -15,7 +15,7 @@ from pytensor.tensor.variable import TensorVariable
 from ...parallel.cpu_affinity import available_cores
 from ...parallel.shared_rows import evaluated_rows
 from ...parallel.signals import held_interrupts
-from ...parallel.threads import run_in_threads
+from ...parallel.threads import Pace, run_in_threads, timed
 from .entry_point import njit_cached
 from .pytensor_function import Call, make_call
 
@@ -75,6 +75,7 @@ class Rows:
         self._varying = function.example[:n_varying]
         self._constant = function.example[n_varying:]
         self.on_progress: Callable[[int], None] = lambda count: None
+        self._pace = Pace()
         self.is_shared = True  # by ranks; a message takes longer than a cheap function
 
     def __call__(self, *columns: np.ndarray) -> list[np.ndarray]:
@@ -134,13 +135,14 @@ class Rows:
         n_threads = min(available_cores(), len(rows))
         ends = np.linspace(0, len(rows), n_threads + 1).astype(int)
         control = np.zeros((n_threads, 2), dtype=np.int64)
-        if len(rows) == 1:  # as in a search; a thread would take a millisecond
+        if len(rows) == 1 or self._pace.is_short(len(rows)):  # as in a search
             with held_interrupts():
-                self._call_part(rows, results, control[0])
-            self.on_progress(1)
+                seconds = timed(partial(self._call_part, rows, results, control[0]))
+            self._pace.measured(len(rows), seconds)
+            self.on_progress(len(rows))
             return results
         parts = [slice(*ends[i : i + 2]) for i in range(n_threads)]
-        run_in_threads(
+        seconds = run_in_threads(
             [
                 partial(self._call_part, rows[part], results[part], control[i])
                 for i, part in enumerate(parts)
@@ -150,6 +152,7 @@ class Rows:
             stop=lambda: control[:, _STOP].fill(True),
             on_progress=self.on_progress,
         )
+        self._pace.measured(len(rows), seconds)
         return results
 
     def _call_part(

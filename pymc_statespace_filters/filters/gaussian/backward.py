@@ -125,7 +125,9 @@ def _tape_of(call, machine, table, records):
     n_states, size = n_states_on_tape(call, machine, records), machine.size * machine.width
     tape, n_records = np.empty(n_states * size), table.theta.shape[0]
     terms, health = np.empty(n_rows * n_records), np.empty((n_records, HEALTH_SIZE))
-    n_taped = forward_pass(machine, settings_of(call.plan), table, records, tape, terms, health)
+    n_taped = forward_pass(
+        machine, settings_of(call.plan), table, records, tape, terms, health, np.empty((0, 0))
+    )
     for record in range(n_records):
         if health[record, 1] != NONE:
             return tape[:0]

@@ -39,6 +39,7 @@ class GaussianFilterBase(TapedFilter):
     """Compiles a filter from its ``linearization``."""
 
     resumes: ClassVar[bool] = True
+    resumes_many: ClassVar[bool] = True
 
     @property
     def linearization(self) -> Linearization:

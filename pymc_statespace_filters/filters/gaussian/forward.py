@@ -31,23 +31,31 @@ from .group import (
     earliest,
     load_forces,
     load_parameters,
+    load_states,
     n_states_on_tape,
     n_stretches,
     parameters_of,
     records_of,
+    set_all,
+    states_wanted,
+    status_of_states,
     step_at,
+    store_states,
     table_of,
 )
 from .machine import STRETCH, call, n_lanes_of, read_machine, rows_at, workspace
 
 
 @njit_internal
-def forward_pass(machine, covariances, table, records, tape, terms, health):
+def forward_pass(machine, covariances, table, records, tape, terms, health, after):
     """Write all terms, and the health (G, 3) of each record; a tape without numbers is not written.
 
-    ``covariances`` are those to check, see `functions.checked`. Returns the numbers on the tape.
+    ``covariances`` are those to check, see `functions.checked`. The states that the filter leaves
+    are written to ``after``, NaN where it fails, unless that is empty. Returns the numbers on the
+    tape.
     """
     m, work, place = machine, workspace(machine), np.int64(0)
+    set_all(after.reshape(after.size), np.nan)
     size, lanes = m.size * m.width, np.empty((N_OF_LANE, m.width), np.int64)
     for first in range(0, records.shape[0], m.width):
         group = records[first : min(first + m.width, records.shape[0])]
@@ -55,8 +63,8 @@ def forward_pass(machine, covariances, table, records, tape, terms, health):
         begin(lanes, group, table.rows)
         call(m.start, m, n_lanes_of(m, group), work, work.states, work.forces, table.t0, 0, 1)
         copy(work.states[size:], work.states[:size])
-        if table.before.size:  # of a record alone
-            copy(table.before, work.states[:size])
+        if table.before.size:
+            load_states(m, table, group, work.states)
         n_alive = _set_out(m, covariances, work.W, lanes, group, terms, health)
         if n_alive == 0:
             continue
@@ -66,6 +74,8 @@ def forward_pass(machine, covariances, table, records, tape, terms, health):
             place += _side_by_side(
                 m, work, table, group, lanes, n_alive, tape[place:], terms, health
             )
+        if after.size:
+            store_states(m, table, group, work.states, health, after)
     return place
 
 
@@ -77,7 +87,7 @@ def _side_by_side(machine, work, table, records, lanes, n_alive, tape, terms, he
     W, states, t0 = work.W, work.states, table.t0
     d, seen = rows_at(m, W, m.rows.d, m.p), rows_at(m, W, m.rows.seen, 1)
     term = rows_at(m, W, m.rows.term, 1)
-    k = place = 0
+    k, place = np.int64(table.first), np.int64(0)
     while n_alive:
         step = earliest(lanes)
         if step == NEVER:
@@ -105,7 +115,7 @@ def _side_by_side(machine, work, table, records, lanes, n_alive, tape, terms, he
 
 @njit_internal
 def _along(machine, work, table, record, tape, terms, health):
-    """Go along a record alone; return how many numbers are on the tape."""
+    """Go along a record alone to its last state; return how many numbers are on the tape."""
     m, states, stride = machine, work.states, np.int64(0)
     if tape.size > 0:
         copy(states, tape[: m.size])
@@ -116,6 +126,7 @@ def _along(machine, work, table, record, tape, terms, health):
     k = step_at(table.rows, record[BEGIN] + last) if n_rows else table.first
     place = stride * (j + k - table.first)
     if j == n_rows:
+        copy(states[place:], work.states[: m.size])
         return place
     row, at = record[BEGIN] + j, record[SHIFT] + record[BEGIN] + j
     health[point, 1] = failure_along(m, work.W, table, row, states[place:], terms[at])
@@ -228,6 +239,9 @@ def _forward(plan, record, request, results):
     if status != OK:
         return status
     machine, to = read_machine(opening.plan), opening.results
+    status = status_of_states(opening, machine)
+    if status != OK:
+        return status
     if opening.plan[PLAN.leaves_tape]:
         records = records_of(opening, machine)
         to[RESULTS.n_tape] = n_states_on_tape(opening, machine, records)
@@ -244,7 +258,10 @@ def _forward(plan, record, request, results):
     records, is_panel = records_of(opening, machine), given[RECORD.row_width] > 1
     healths = np.empty((given[RECORD.n_records], HEALTH_SIZE)) if is_panel else health
     table = table_of(opening, parameters_of(opening), np.empty((0, 0)), np.empty(0))
-    n_taped = forward_pass(machine, settings_of(opening.plan), table, records, tape, terms, healths)
+    n_taped = forward_pass(
+        machine, settings_of(opening.plan), table, records, tape, terms, healths,
+        states_wanted(opening),
+    )  # fmt: skip
     if is_panel:
         first_failure(healths, health[0])
     if n_tape:

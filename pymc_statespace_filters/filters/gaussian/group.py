@@ -13,10 +13,11 @@ import numpy as np
 from ...compiler.codegen.arguments import AlongArguments
 from ...compiler.native.entry_point import call_address
 from ...compiler.native.jit import inline_always, njit_internal
-from ...compiler.native.plan import RECORD
+from ...compiler.native.plan import RECORD, REQUEST, RESULTS, STATE
 from ...compiler.numerics.order import stable_order
 from ...system import panel_records as panel
-from ..calls import integers_at, reals_at, state_given
+from ..calls import OK, integers_at, reals_at
+from ..outcomes import NONE
 from ..plan import PLAN
 from .machine import STRETCH
 
@@ -40,7 +41,8 @@ class Table(NamedTuple):
 
     ``theta`` are the parameters that the functions take. ``noises`` has a row for each step, and
     ``x`` is an error of the start, where states are drawn. A record that goes on from earlier rows
-    begins at the step ``first`` with the state ``before``, which is empty otherwise.
+    begins at the step ``first``; each of its points does so with the state behind a step in
+    ``before``, which is empty otherwise.
     """
 
     rows: np.ndarray
@@ -57,7 +59,7 @@ class Table(NamedTuple):
 @njit_internal
 def table_of(call, theta, noises, x):
     """The table of a call."""
-    given, state = call.record, state_given(call.request)
+    given, before = call.record, _states_given(call)
     n_rows, width = given[RECORD.n_rows], given[RECORD.row_width]
     n_inputs = given[RECORD.n_inputs]
     return Table(
@@ -68,9 +70,38 @@ def table_of(call, theta, noises, x):
         noises=noises,
         x=x,
         t0=reals_at(given[RECORD.starts], (given[RECORD.n_starts],))[0],
-        first=int(state[0]) if state.size else 0,
-        before=state[1:],
+        first=int(before[0, 0]) if before.size else 0,
+        before=before,
     )
+
+
+@njit_internal
+def _states_given(call):
+    request = call.request
+    return reals_at(request[REQUEST.state], (request[REQUEST.n_before], request[REQUEST.n_state]))
+
+
+@njit_internal
+def status_of_states(call, machine):
+    """A status: whether each point goes on from a state, all at one step; writes their size."""
+    before, size = _states_given(call), 1 + machine.size
+    call.results[RESULTS.n_state] = size
+    if before.size == 0:
+        return OK
+    if before.shape != (call.record[RECORD.n_records], size):
+        return np.int64(STATE)
+    for i in range(before.shape[0]):
+        if before[i, 0] != before[0, 0]:
+            return np.int64(STATE)
+    return OK
+
+
+@njit_internal
+def states_wanted(call):
+    """Where the states that the filter leaves at the points go; empty if they are not wanted."""
+    to = call.results
+    n_points = to[RESULTS.n_points] if to[RESULTS.state] != 0 else 0
+    return reals_at(to[RESULTS.state], (n_points, to[RESULTS.n_state]))
 
 
 @inline_always
@@ -177,6 +208,28 @@ def load_parameters(machine, table, records, W):
         point = records[min(lane, records.shape[0] - 1), POINT]
         for i in range(machine.n_theta):
             W[i * machine.width + lane] = table.theta[point, i]
+
+
+@njit_internal
+def load_states(machine, table, records, states):
+    """Write the states from which the records go on to lanes; spare lanes repeat the last."""
+    for lane in range(machine.width):
+        point = records[min(lane, records.shape[0] - 1), POINT]
+        for i in range(machine.size):
+            states[i * machine.width + lane] = table.before[point, 1 + i]
+
+
+@njit_internal
+def store_states(machine, table, records, states, health, after):
+    """Write what the filter leaves at the points of a group that has not failed."""
+    for lane in range(records.shape[0]):
+        point, n_rows = records[lane, POINT], records[lane, N_ROWS]
+        if health[point, 1] != NONE:
+            continue
+        last = step_at(table.rows, records[lane, BEGIN] + n_rows - 1) if n_rows else table.first
+        after[point, 0] = last
+        for i in range(machine.size):
+            after[point, 1 + i] = states[i * machine.width + lane]
 
 
 @njit_internal

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...compiler.codegen.function_types import jit
 from ...compiler.native.jit import njit_internal
-from ...compiler.native.plan import HEALTH_SIZE, RECORD, REQUEST, RESULTS, STATE, Plan, plan_entry
+from ...compiler.native.plan import HEALTH_SIZE, RECORD, REQUEST, RESULTS, Plan, plan_entry
 from ...compiler.numerics.normals import BLOCK, FILL_NORMALS
 from ...compiler.numerics.philox import STATES
 from ...compiler.numerics.small_cholesky import covariance_root
@@ -37,6 +37,8 @@ from .group import (
     parameters_of,
     records_of,
     set_all,
+    states_wanted,
+    status_of_states,
     table_of,
 )
 from .linearization import Linearizations
@@ -94,7 +96,9 @@ def taped_pass(opening, machine, covariances, table, health):
     n_rows, size = opening.record[RECORD.n_rows], machine.size
     terms = reals_at(to[RESULTS.terms], (n_rows,)) if to[RESULTS.terms] else np.empty(n_rows)
     tape = np.empty(n_states_on_tape(opening, machine, records) * size)
-    n_taped = forward_pass(machine, covariances, table, records, tape, terms, health)
+    n_taped = forward_pass(
+        machine, covariances, table, records, tape, terms, health, states_wanted(opening)
+    )
     end = n_steps_of(table) + 1
     if health[0, 1] != NONE:
         # Without valid covariances, not even the start is known.
@@ -258,11 +262,8 @@ def _run(plan, record, request, results):
     if status != OK:
         return status
     rows, to, machine = wanted_rows(opening), opening.results, read_machine(opening.plan)
-    to[RESULTS.n_state] = 1 + machine.size  # a step, and the state
-    before = opening.request[REQUEST.n_state]
-    if before != 0 and before != to[RESULTS.n_state]:
-        return np.int64(STATE)
-    if opening.request[REQUEST.sizes_only]:
+    status = status_of_states(opening, machine)
+    if status != OK or opening.request[REQUEST.sizes_only]:
         return status
     n, n_wanted = machine.n, rows.size
     mean, cov = room(to[RESULTS.mean], n_wanted, n), room(to[RESULTS.cov], n_wanted, n * n)
@@ -287,12 +288,6 @@ def _run(plan, record, request, results):
                     covariance, at = s[at], at + 1
                 cov[r, a * n + b] = cov[r, b * n + a] = covariance
         n_effective[r, 0] = np.inf
-    if to[RESULTS.state] != 0:
-        state, k = reals_at(to[RESULTS.state], (1 + machine.size,)), n_steps_of(table)
-        set_all(state, np.nan)
-        if health[0, 1] == NONE:
-            state[0] = k
-            copy(tape[k - table.first + steps.size], state[1:])
     return OK
 
 
