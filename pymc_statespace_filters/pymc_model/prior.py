@@ -3,17 +3,13 @@
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import pymc as pm
-import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pymc.distributions.continuous import FlatRV, HalfFlatRV
 from pymc.distributions.multivariate import ICARRV
-from pymc.pytensorf import collect_default_updates, reseed_rngs
 from pymc.pytensorf import compile as compile_pymc
-from pytensor.compile import SharedVariable
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.random.basic import UniformRV
@@ -21,6 +17,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
 from .density import ModelDensity, RowFunction
+from .prior_draws import PriorDraws
 
 _IMPROPER = (FlatRV, HalfFlatRV, ICARRV)  # PyMC's densities without a finite integral
 _N_TRIED = 50  # draws to test whether a transform is invertible on the whole support
@@ -150,13 +147,10 @@ class ModelPrior:
                 f"the prior of {', '.join(restricted)} cannot be sampled: its transform excludes "
                 "a part of the distribution's support, and the density is not normalised"
             )
-        draw, generators = self._draw
-        reseed_rngs(generators, int(rng.integers(2**31)))
         try:
-            draws = [np.concatenate(draw()) for _ in range(count)]
+            found = self._draws(count, rng)
         except NotImplementedError as error:
             raise ModelError(f"the prior cannot be sampled: {error}") from None
-        found = np.array(draws, dtype=np.float64).reshape(count, -1)
         if on_edge := int((~np.isfinite(found)).any(axis=-1).sum()):
             raise ModelError(
                 f"{on_edge} of {count} draws of the prior are rounded to the edge of their "
@@ -187,16 +181,8 @@ class ModelPrior:
         return density
 
     @cached_property
-    def _draw(self) -> tuple[Any, list[SharedVariable]]:
-        """A function that draws all free variables, unconstrained, and its generators."""
-        mapped = []
-        for rv in self._free:
-            transform = self._model.rvs_to_transforms[rv]
-            value = rv if transform is None else transform.forward(rv, *rv.owner.inputs)
-            mapped.append(pt.flatten(value))
-        # Machine code would take seconds to compile and halve the time of a draw, about 0.1 ms.
-        draw = compile_pymc([], mapped, mode="FAST_COMPILE")
-        return draw, list(collect_default_updates(inputs=[], outputs=mapped))
+    def _draws(self) -> PriorDraws:
+        return PriorDraws(self._model, self._free)
 
 
 class ModelFactors:

@@ -8,8 +8,10 @@ from scipy.special import expit, logsumexp
 from scipy.stats import halfnorm, kstest, norm
 
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.pymc_model import prior_draws
 from pymc_statespace_filters.pymc_model.density import ModelDensity
 from pymc_statespace_filters.pymc_model.prior import ModelPrior
+from pymc_statespace_filters.pymc_model.prior_draws import PriorDraws
 
 N = 4000
 
@@ -45,6 +47,22 @@ def test_the_law_of_every_variable(draws):
     exponents = np.column_stack([draws[:, 4:], -draws[:, 4:].sum(axis=1)])
     w = np.exp(exponents - logsumexp(exponents, axis=1, keepdims=True))
     assert kstest(w[:, 0], lambda p: 1 - (1 - p) ** 5).pvalue > 1e-3  # Beta(1, 5)
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_many_draws_in_one_call_are_one_call_for_each(model, draws, is_known, monkeypatch):
+    """To rounding in transforms; a half-Cauchy is drawn one by one."""
+    with model if is_known else pm.Model() as own:
+        if not is_known:
+            pm.Normal("x", pm.HalfCauchy("scale", 1), [1.0, 2.0])
+    together = PriorDraws(own, own.free_RVs)
+    assert together._is_joint == is_known
+    monkeypatch.setattr(prior_draws, "_first_parameters", lambda outputs: [])
+    alone = PriorDraws(own, own.free_RVs)
+    found, expected = (one(150, np.random.default_rng(1)) for one in (together, alone))
+    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
+    if is_known:
+        np.testing.assert_array_equal(found, draws[:150])
 
 
 def test_columns_and_rows_are_independent_where_the_law_says_so(draws):
