@@ -10,6 +10,7 @@ import pytensor.tensor as pt
 import pytest
 import xarray as xr
 from numba import njit
+from pytensor.graph.traversal import ancestors
 from scipy.stats import multivariate_normal
 
 import pymc_statespace_filters as psf
@@ -444,6 +445,25 @@ def test_means_of_probabilities_are_those_of_a_grid(kind):
         for i, h in enumerate(1e-5 * np.eye(5)):
             change = (given(gaussian + h)[0] - given(gaussian - h)[0]) / 2e-5
             assert slope[i] == pytest.approx(change, abs=1e-7)
+
+
+def test_nodes_of_a_quadrature_share_a_graph():
+    """Which would grow, and with it the time to compile a gradient, with their number."""
+
+    def size(slope):
+        system = switching(
+            transition=lambda x, q: [x[0], x[1], q[0]],
+            process_dist=lambda x: [pm.Bernoulli.dist(pt.sigmoid(x[0] + slope * x[1]))],
+            initial_dist=lambda: [pm.Normal.dist(0, 1), pm.Normal.dist(0, 1), 0],
+            states=["level", "trend", "regime"],
+            inputs=[],
+        )
+        hybrid, s = hybrid_of(system), pt.tensor("s", shape=(5,), dtype="float64")
+        drawn = [pt.constant(v) for v in hybrid.drawn]
+        found = draws_of(hybrid, symbols_of(system), pt.zeros(1), s, drawn)
+        return len(list(ancestors([part.state for part in found])))
+
+    assert size(1.0) < 3 * size(0.0)  # 48 nodes, not 12
 
 
 @pytest.mark.parametrize("filter", [psf.IMM(), psf.RBPF(10)], ids=str)

@@ -12,7 +12,7 @@ import numpy as np
 import pytensor
 import pytensor.tensor as pt
 from numpy.typing import NDArray
-from pytensor.graph.replace import graph_replace
+from pytensor.graph.replace import graph_replace, vectorize_graph
 from pytensor.tensor.variable import TensorVariable
 
 from ...compiler.codegen.semidefinite import semidefinite_root
@@ -68,9 +68,9 @@ def _given(
         )
         root = root @ _reflection(root.T @ graph_replace(slope, {x: mean}, strict=False))
     nodes, weights = _rule(len(hybrid.deciding))
-    at = [graph_replace(probability, {x: mean + root @ node}, strict=False) for node in nodes]
-    joint = pt.stack(at) * weights
-    total = pt.stack(at) @ weights  # sums of more than 32 terms are not for every backend
+    at = vectorize_graph(probability, {x: mean + pt.constant(nodes) @ root.T})
+    joint = at * weights
+    total = at @ weights  # sums of more than 32 terms are not for every backend
     is_possible = pt.neq(total, 0.0)
     share = pt.switch(is_possible, joint / pt.switch(is_possible, total, 1.0), weights)
     first = share @ nodes
