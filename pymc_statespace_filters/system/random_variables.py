@@ -16,6 +16,7 @@ from pytensor.graph.traversal import ancestors, io_toposort
 from pytensor.tensor.elemwise import Elemwise
 from pytensor.tensor.math import Prod, Sum
 from pytensor.tensor.random.op import RandomVariable
+from pytensor.tensor.subtensor import BaseSubtensor
 from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
@@ -255,6 +256,10 @@ def _rebuilt(role: str, node: Apply, inputs: Sequence[Variable]) -> list[Variabl
     """The outputs of an operation with draws, which are double-precision, among its inputs."""
     if isinstance(node.op, Sum | Prod):  # of whole numbers, which accumulate as such
         return [type(node.op)(axis=node.op.axis)(*inputs)]
+    if isinstance(node.op, BaseSubtensor):
+        indices = node.inputs[1:]
+        kept = [_as_whole(new, old) for new, old in zip(inputs[1:], indices, strict=True)]
+        inputs = [inputs[0], *kept]
     try:
         return node.clone_with_new_inputs(list(inputs), strict=False).outputs
     except Exception as error:
@@ -262,6 +267,11 @@ def _rebuilt(role: str, node: Apply, inputs: Sequence[Variable]) -> list[Variabl
             f"{role} must use what it draws as a number, got it in {node.op} ({error}); where it "
             "is an index or a truth value, write pt.switch(pt.eq(draw, 0), a, b)"
         ) from error
+
+
+def _as_whole(new: Variable, index: Variable) -> Variable:
+    """A draw that is an index, which is a whole number, as such."""
+    return new if new.type == index.type else pt.cast(new, index.type.dtype)
 
 
 def _are_separate(entries: Sequence[TensorVariable], variables: Sequence[Apply]) -> bool:

@@ -210,6 +210,22 @@ def test_draws_may_be_summed_and_multiplied():
     assert abs(one_step(product, 0.7, 20_000).mean() - 0.49) < 5 * 0.5 / np.sqrt(20_000)
 
 
+@pytest.mark.parametrize("cast", [lambda k: k, lambda k: pt.cast(k, "int32")])
+def test_a_draw_may_be_an_index(cast):
+    """Of a number in a table, and of a row."""
+    scale, rows = pt.constant([0.1, 10.0]), pt.constant([[0.0, 0.0], [0.0, 1000.0]])
+
+    def chosen(x):
+        k = cast(pm.Categorical.dist([0.3, 0.7]))
+        return pm.Normal.dist(0, scale[k]) + rows[k][1]
+
+    found = one_step(system_of(chosen), 0.7, 4000)
+    first, second = found[found < 500], found[found >= 500] - 1000
+    assert stats.binomtest(len(first), len(found), 0.3).pvalue > LEAST_P
+    for drawn, sd in ((first, 0.1), (second, 10.0)):
+        assert stats.kstest(drawn / sd, "norm").pvalue > LEAST_P
+
+
 def test_a_bad_parameter_fails_in_a_counted_way():
     system = psf.StateSpaceModel(
         transition=lambda x, q: [x[0] + q[0]],
@@ -249,7 +265,7 @@ def test_a_bad_parameter_fails_in_a_counted_way():
             r"must draw one vector by each Multinomial, got shape \(3, 2\)",
         ),
         (
-            lambda x: pt.eye(2)[pm.Bernoulli.dist(x)][0],
+            lambda x: pt.eye(2)[pt.stack([pm.Bernoulli.dist(x), 0])][0, 0],
             "or a truth value, write pt.switch",
         ),
         (lambda x: pm.Normal.dist(x, 1, shape=(2, 2)), "scalar or vector distributions"),
