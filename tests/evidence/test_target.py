@@ -98,6 +98,9 @@ class TestShortfall:
         assert text == "0.08 nats come from the draws: about 3200 instead of 1000 would do"
         text = shortfall(0.05, 0.03, 0.06, 1000, "a remedy")
         assert text == "0.06 nats come from the evaluations: a remedy"
+        # So many draws would do if the evaluations' error were half as large.
+        text = shortfall(0.05, 0.041, 0.04, 1000, "a remedy")
+        assert text == "0.04 nats come from the evaluations: a remedy"
         assert shortfall(0.05, 0.03, 0.03, 1000, "a remedy") == ""
         assert shortfall(None, 0.3, 0.3, 1000, "a remedy") == ""
 

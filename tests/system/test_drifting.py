@@ -206,6 +206,15 @@ def test_elements_and_arrays_of_parameters_drift():
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 
+def test_parameters_drift_independently():
+    system = psf.drifting(pushed(), a=psf.RandomWalk(), gain=psf.RandomWalk())
+    params = PARAMS | {"a_strength": 0.3, "gain_strength": 0.5}
+    nothing = np.full(5, np.nan)
+    run = psf.run_filter(system, psf.EKF(), params, nothing, steps=GRID, inputs=PUSH)
+    found = run["cov"].values[-1][1:, 1:]
+    np.testing.assert_allclose(found, GRID[-1] * DT * np.diag([0.09, 0.25]), atol=1e-12)
+
+
 def test_several_calls_are_one():
     walk = psf.RandomWalk()
     twice = psf.drifting(psf.drifting(pushed(), a=walk), gain=walk)

@@ -68,9 +68,9 @@ def shortfall(
     """
     if target_se is None or math.hypot(se_draws, se_evaluations) <= target_se:
         return ""
-    if se_evaluations > DOMINANT * se_draws:
-        return f"{se_evaluations:.2g} nats come from the evaluations: {remedy}"
     needed = n_draws * (1 + RATIO**2) * (se_draws / target_se) ** 2
+    if se_evaluations > DOMINANT * se_draws or needed <= n_draws:
+        return f"{se_evaluations:.2g} nats come from the evaluations: {remedy}"
     return (
         f"{se_draws:.2g} nats come from the draws: about {_rounded(needed)} instead of {n_draws} "
         "would do"
