@@ -16,9 +16,11 @@ import numpy as np
 from arviz_stats.base import array_stats
 
 import pymc_statespace_filters as psf
+from benchmarks.hard_posteriors import HARD
 from benchmarks.posteriors import POSTERIORS
 from pymc_statespace_filters.sampling.choice import choose_sampler, why_no_nuts
 
+ALL = POSTERIORS | HARD
 MOST_SECONDS = 600
 
 
@@ -37,7 +39,7 @@ def least_ess(posterior) -> float:
 def run(name: str, sampler: str) -> dict:
     """One run in this process."""
     logging.getLogger("pymc").setLevel(logging.ERROR)
-    model, began = POSTERIORS[name](), time.process_time()
+    model, began = ALL[name](), time.process_time()
     idata = psf.sample(model=model, sampler=sampler, random_seed=1, progressbar=False)
     seconds = time.process_time() - began
     ess = least_ess(idata["posterior"])
@@ -46,7 +48,7 @@ def run(name: str, sampler: str) -> dict:
 
 def row(name: str) -> str:
     """A row of the table."""
-    model = POSTERIORS[name]()
+    model = ALL[name]()
     chosen, found = choose_sampler(model, 4, 1000), {}
     for sampler in ("dram",) if why_no_nuts(model) else ("dram", "nuts"):
         command = [sys.executable, "-m", "benchmarks.choice", "--run", name, sampler]
@@ -69,7 +71,7 @@ def main() -> None:
         return
     print("| posterior | DRAM: CPU, ESS per CPU second | NUTS | chosen | because |")
     print("| --- " * 5 + "|")
-    for name in POSTERIORS:
+    for name in ALL:
         if not sys.argv[1:] or any(name.startswith(begin) for begin in sys.argv[1:]):
             print(row(name), flush=True)
 
