@@ -151,7 +151,11 @@ class StateSpace(Continuous):
         dims: Sequence[str] | None = None,
     ) -> TensorVariable:
         """Add the variable, its coordinates and its seed to the model of the context."""
-        model = pm.modelcontext(None)
+        model = pm.Model.get_context(error_if_none=False)
+        if model is None:
+            raise TypeError(
+                "No model on context stack: add StateSpace inside a `with model:` block"
+            )
         if not isinstance(name, str) or not name:
             raise ModelError(f"name must be a text that is not empty, got {name!r}")
         check_system_and_filter(system, filter)

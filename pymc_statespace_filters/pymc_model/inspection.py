@@ -27,7 +27,10 @@ def given_model(model: pm.Model | None) -> pm.Model:
     """The model, or that of the ``with`` block; a `ModelError` if it is something else."""
     if not isinstance(model, pm.Model | None):
         raise ModelError(f"model must be a pymc.Model, got {type(model).__name__}")
-    return pm.modelcontext(model)
+    found = pm.Model.get_context(error_if_none=False) if model is None else model
+    if found is None:
+        raise ModelError("model must be given outside a `with` block of a model, got None")
+    return found
 
 
 def state_space_nodes(model: pm.Model) -> dict[str, Any]:

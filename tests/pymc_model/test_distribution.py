@@ -244,8 +244,10 @@ def test_wrong_system_filter_and_inputs_that_nobody_asked_for():
 
 
 def test_outside_a_model():
-    with pytest.raises(TypeError, match="No model on context stack"):
+    with pytest.raises(TypeError, match="No model on context stack: add StateSpace inside"):
         pair_variable(params={"a": 1.0})
+    with pytest.raises(ModelError, match=r"model must be given outside a `with` block .* got None"):
+        psf.sample()
 
 
 def test_name_clash():
