@@ -58,9 +58,10 @@ class Equation:
         except ModelError:
             raise
         except Exception as error:
+            reason = str(error).rstrip(".")
             raise ModelError(
                 f"{self.role} could not be traced with symbolic arguments "
-                f"({', '.join(arguments)}): {type(error).__name__}: {error}. "
+                f"({', '.join(arguments)}): {type(error).__name__}: {reason}. "
                 + (_WITHOUT_STATE if self._may_lack_state else _HOW_TO_WRITE)
             ) from error
 

@@ -93,8 +93,8 @@ def symbolic_data(observed: Any, system: StateSpaceModel, n_rows: int) -> Variab
         return pt.as_tensor(check_observed(observed, system, n_rows))
     if observed.type.ndim != 2:
         raise ModelError(
-            f"observed must have 2 dimensions (rows, observables) if it is symbolic, got "
-            f"{observed.type.ndim}"
+            "observed must have 2 dimensions (rows, observables) if it is symbolic, as pm.Data is, "
+            f"got {observed.type.ndim}: for one observable give it values[:, None]"
         )
     if isinstance(observed, SharedVariable):
         check_observed(observed.get_value(), system, n_rows)
