@@ -19,7 +19,7 @@ from pymc_statespace_filters.compiler.lowering.symbols import symbols_of
 from pymc_statespace_filters.errors import FilterWarning, ModelError
 from pymc_statespace_filters.filters.regimes.draws import draws_of
 from pymc_statespace_filters.filters.regimes.hybrid import hybrid_of
-from pymc_statespace_filters.filters.regimes.moments import _row_of_cov
+from pymc_statespace_filters.filters.regimes.moments import _row_of_cov, draw_of_mixture
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.distributed import DistributedLogLikelihood
 from pymc_statespace_filters.ops.likelihood import LogLikelihoodOfNoise, StoredNoise
@@ -103,6 +103,14 @@ def check_mean_likelihood(filter, exact, n_seeds, **others):
 def test_the_mean_likelihood_of_particles_is_exact(n_particles):
     ratios = check_mean_likelihood(psf.RBPF(n_particles), exact_log_likelihood(), 4000)
     assert ratios.std() > 0.05  # it is an estimate
+
+
+def test_the_mean_likelihood_of_particles_is_exact_where_the_sensor_switches():
+    """As IMM is at the first observation: Gaussians that it has merged were the same."""
+    system = switching(observation=lambda x: [x[0] + 1.5 * x[1]])
+    record = {"steps": np.array([1]), "observed": np.array([[1.9]])}
+    exact = log_likelihood(psf.IMM(), system, **record)
+    check_mean_likelihood(psf.RBPF(4), exact, 4000, system=system, **record)
 
 
 @pytest.mark.slow
@@ -329,6 +337,21 @@ def test_covariances_of_a_part_are_the_rows_of_a_lower_triangle():
     pairs = list(zip(*np.tril_indices(3), strict=True))
     assert [row(i, j) for i, j in pairs] == [row(j, i) for i, j in pairs] == [5, 6, 7, 8, 9, 10]
     assert row(-1, 1) == -1
+
+
+def test_normal_states_of_a_draw_are_independent():
+    """So are their squares, whose correlation has an error of 0.01."""
+
+    @njit
+    def drawn(X, order, n):
+        out = np.empty((n, order.size))
+        for seed in range(n):
+            draw_of_mixture(np.ones(1), X, 1, order, seed, 0, out[seed])
+        return out
+
+    X = np.array([[1.0, 0.0, 0.0, 1.0, 0.0, 1.0]]).T  # a regime, means, lower triangle
+    squares = drawn(X, np.array([1, 2, 0]), 10_000)[:, :2] ** 2
+    assert abs(np.corrcoef(squares.T)[0, 1]) < 0.04
 
 
 def test_the_gradient_is_that_of_the_value():

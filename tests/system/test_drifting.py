@@ -339,7 +339,7 @@ def test_laws_in_own_units_are_those_of_draws():
     )
     mean, root = (
         np.array([0.3, -0.2, 0.5]),
-        np.array([[1.0, 0, 0], [0.3, 0.4, 0], [-0.5, 0.2, 0.6]]),
+        np.array([[1.2, 0, 0], [0.3, 0.4, 0], [-0.5, 0.2, 0.6]]),
     )
     cov = root @ root.T
     (found_mean,), (found,) = law_in_own_units(system, mean[None], cov[None])
