@@ -15,7 +15,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 import pymc_statespace_filters as psf
-from tests.costs import Costs, resident_mb
+from tests.costs import resident_mb
 from tests.waiting import LIMIT
 
 ROOT = Path(__file__).parents[1]
@@ -175,6 +175,20 @@ def test_make_says_what_is_missing_if_no_python_fits(make):
     assert "venv" in done.stdout
 
 
+def run_as_make_does(tests):
+    """Run the tests of a folder by the options of the Makefile."""
+    (options,) = re.findall(r"^PYTEST = (.*)$", (ROOT / "Makefile").read_text("utf-8"), re.M)
+    settings = ("-p", "tests.conftest", "-c", ROOT / "pyproject.toml")
+    return subprocess.run(
+        [sys.executable, *options.split(), *settings, tests],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=LIMIT,
+        check=False,
+    )
+
+
 DYING = """
 import os, time
 import pytest
@@ -193,30 +207,22 @@ def test_a_worker_that_dies_ends_the_run(tmp_path):
     for number in range(4):
         file = tmp_path / f"test_{number}.py"
         file.write_text(DYING.format(dies=number == 1), encoding="utf-8")
-    (options,) = re.findall(r"^PYTEST = (.*)$", (ROOT / "Makefile").read_text("utf-8"), re.M)
-    settings = ("-p", "tests.conftest", "-c", ROOT / "pyproject.toml")
-    done = subprocess.run(
-        [sys.executable, *options.split(), *settings, tmp_path],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=LIMIT,
-        check=False,
-    )
+    done = run_as_make_does(tmp_path)
     assert done.returncode == 1, done.stderr
     assert "crashed while running" in done.stdout
     assert "worker restarting disabled" in done.stdout
 
 
-def test_a_file_that_compiles_more_than_it_is_known_to_fails():
-    costs = Costs(None)
-    costs.stored = {"known.py": 100}
-    for name, n in (("known.py", 115), ("unknown.py", 1000)):
-        costs.before, costs.n_compiled = (0.0, 0), n
-        costs.end_file(name)
-    costs.before, costs.n_compiled = (0.0, 0), 116
-    with pytest.raises(pytest.fail.Exception, match=r"known.py compiles 116 functions, 100 in"):
-        costs.end_file("known.py")
+@pytest.mark.parametrize("most", [1, 2])
+def test_a_run_that_compiles_more_than_is_known_fails(tmp_path, most):
+    for name in ("one", "other"):
+        lines = "from numba import njit", f"def test_{name}():", "    njit(lambda x: x + 1)(1)"
+        (tmp_path / f"test_{name}.py").write_text("\n".join(lines), encoding="utf-8")
+    known = f"import tests.costs\ntests.costs.MOST = {most}"
+    (tmp_path / "conftest.py").write_text(known, encoding="utf-8")
+    done = run_as_make_does(tmp_path)
+    assert done.returncode == (most < 2), done.stdout
+    assert ("2 functions were compiled" in done.stdout) == (most < 2), done.stdout
 
 
 @pytest.mark.skipif(
