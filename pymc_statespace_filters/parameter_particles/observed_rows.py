@@ -125,8 +125,10 @@ class ObservedRows:
         """Particles with the factor of one more row, by one update of each filter."""
         past = particles.log_likelihood
         alive = np.isfinite(past)
-        known = particles.at(alive)
+        known = particles if alive.all() else particles.at(alive)
         terms, after = self.filtered(known.x, known.seeds, known.states, row, row + 1)
+        if known is particles:
+            return particles._replace(past=past, increment=terms[:, 0], states=after)
         increment, new = np.full(len(past), -np.inf), np.full((len(past), after.shape[1]), np.nan)
         increment[alive], new[alive] = terms[:, 0], after
         return particles._replace(past=past, increment=increment, states=new)

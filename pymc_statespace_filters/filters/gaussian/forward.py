@@ -140,14 +140,14 @@ def _set_out(machine, covariances, W, lanes, records, terms, health):
 
     A filter of moments would go on with a negative variance and give it a likelihood.
     """
-    n_alive = 0
+    n_alive, root = 0, _room_for_roots(covariances)
     for lane in range(records.shape[0]):
         point, first = records[lane, POINT], records[lane, BEGIN]
         is_valid = True
         health[point, 0], health[point, 1], health[point, 2] = np.inf, NONE, -1.0
         for i in range(0, covariances.size, 3):
             row, size, failure = covariances[i : i + 3]
-            if is_valid and not _is_covariance(machine, W, lane, int(row), size):
+            if is_valid and not _is_covariance(machine, W, lane, int(row), int(size), root):
                 is_valid = False
                 health[point, 1], health[point, 2] = failure, first
         lanes[ALIVE, lane] = is_valid
@@ -158,10 +158,17 @@ def _set_out(machine, covariances, W, lanes, records, terms, health):
 
 
 @njit_internal
-def _is_covariance(machine, W, lane, row, size):
+def _room_for_roots(covariances):
+    largest = 0
+    for size in covariances[1::3]:
+        largest = max(largest, int(size))
+    return np.empty(largest * largest)
+
+
+@njit_internal
+def _is_covariance(machine, W, lane, row, n, room):
     """Whether the matrix in these rows of a lane is symmetric and non-negative."""
-    n = int(size)
-    root = np.empty((n, n))
+    root = room[: n * n].reshape((n, n))
     for i in range(n):
         for j in range(n):
             root[i, j] = W[(row + i * n + j) * machine.width + lane]
