@@ -156,7 +156,9 @@ def test_a_jump_is_found_with_its_time_and_size():
     assert 1.23 < scan.paths["band"].mean() < 1.40
     path = scan.paths["cumulated"].sel(parameter="gain")
     assert abs(path).max() > scan.paths["band"].sel(parameter="gain")
-    assert float(path["time"][scan.paths["turn"].sel(parameter="gain")]) == first["time"]
+    turn = scan.paths["turn"].sel(parameter="gain")
+    assert float(path["time"][turn]) == first["time"]
+    assert path[turn] < 0  # before the jump the gain is below its estimate
 
 
 def test_jumps_of_expected_sums_have_their_time_and_size():
@@ -170,6 +172,32 @@ def test_jumps_of_expected_sums_have_their_time_and_size():
         )
         assert _turns(found, 1) == [at]
         np.testing.assert_allclose(_changes(found, np.array([at])), [change])
+
+
+def test_a_turn_is_where_a_jump_gains_most():
+    """By R^2 / [A (1 - A / V)]: 64 / 0.09 of a tenth of the information, 100 / 0.25 of half."""
+    information, sums = np.arange(40.0, 0.0, -1.0), np.zeros(40)
+    sums[36], sums[20] = 8.0, 10.0
+    found = Statistics(
+        *np.zeros((2, 1)), sums[:, None], np.zeros((1, 1)), information[:, None], np.array([40])
+    )
+    assert _turns(found, 1) == [36]
+
+
+def test_data_are_simulated_at_the_posterior_mode():
+    """That of a prior beside which the data weigh little."""
+    with pm.Model() as model:
+        pm.Normal("a", 0.2, 0.01)
+        pm.HalfNormal("sigma", 1.0)
+        pm.Normal("gain", 0, 2)
+        psf.StateSpace("d", driven(), psf.EKF(), steps=STEPS, inputs=FORCE, observed=simulated(1))
+    variable = ScoredVariable(model, "d")
+    start = np.array([0.2, np.log(0.3), 1.0])
+    test = ConstancyTest(variable, TimeAxis.of(model, variable).durations, start)
+    at = test.variable.labels.index("a")
+    assert variable.theta(test.mode.x).reshape(-1, len(variable.labels))[0, at] == pytest.approx(
+        0.2, abs=0.05
+    )
 
 
 def test_simulated_data_are_missing_and_unscored_as_the_data():
