@@ -3,15 +3,21 @@
 The targets are distributions of known masses and evidence 1: the likelihood of each is its density
 over that of a wide prior. A run that is off by more than 3 of its errors should be marked by an
 `EvidenceWarning`. Run it with ``python -m benchmarks.smc 20`` from the root of the repository, for
-20 seeds.
+20 seeds, or with names of targets before the number.
 
 With 15 seeds, 1 of 60 runs on wells and banana was off and not marked. On the funnel the mass of
 the neck was off in all of 4 runs (2 seeds), of which 3 were marked.
+
+With 6 seeds, 1 of 12 runs on the exchangeable labels was off, and not marked. With 8 seeds the mass
+of the needle was off and not marked in 5 with 200 draws, and in none with 1000, of which 2 were
+marked. With a standard deviation of 0.02 it was so in 6 and in 4 of 6: nothing marks a mode that
+hardly any population meets.
 """
 
 import sys
 import time
 import warnings
+from itertools import permutations
 
 import numpy as np
 import pymc as pm
@@ -49,6 +55,27 @@ def wells() -> tuple[pm.Model, dict[str, float]]:
     return with_target(2, log_density, {"narrow": lambda x: x[0] > 0.0}), {"narrow": 0.3}
 
 
+def needle() -> tuple[pm.Model, dict[str, float]]:
+    """A wide well and one so narrow that populations miss it, 8 standard deviations apart."""
+
+    def log_density(x):
+        wide, narrow = normal(x, [-4.0, 0.0], 1.0), normal(x, [4.0, 0.0], 0.08)
+        return pt.logaddexp(np.log(0.7) + wide, np.log(0.3) + narrow)
+
+    return with_target(2, log_density, {"narrow": lambda x: x[0] > 0.0}), {"narrow": 0.3}
+
+
+def labels() -> tuple[pm.Model, dict[str, float]]:
+    """Three means, of which any two may be exchanged: six modes of equal masses."""
+
+    def log_density(x):
+        orders = permutations([-4.0, 0.0, 4.0])
+        return pt.logsumexp(pt.stack([normal(x, list(one), 0.5) for one in orders])) - np.log(6)
+
+    parts = {"rising": lambda x: (x[0] < x[1]) & (x[1] < x[2]), "middle": lambda x: abs(x[0]) < 2}
+    return with_target(3, log_density, parts), {"rising": 1 / 6, "middle": 1 / 3}
+
+
 def banana() -> tuple[pm.Model, dict[str, float]]:
     """A ridge along a parabola, a hundredth as wide as long."""
 
@@ -83,9 +110,12 @@ def run(model: pm.Model, exact: dict[str, float], draws: int, seed: int) -> dict
     return {**z, "marked": marked, "seconds": time.process_time() - began}
 
 
-def main(n_seeds: int) -> None:
-    for build in (wells, banana, funnel):
-        model, exact = build()
+TARGETS = {build.__name__: build for build in (wells, needle, labels, banana, funnel)}
+
+
+def main(targets: list[str], n_seeds: int) -> None:
+    for target in targets:
+        model, exact = TARGETS[target]()
         for draws in DRAWS:
             runs = [run(model, exact, draws, seed) for seed in range(n_seeds)]
             names = ["evidence", *exact]
@@ -95,7 +125,7 @@ def main(n_seeds: int) -> None:
             beyond = dict(zip(names, (z > 3).sum(axis=0).tolist(), strict=True))
             seconds = np.median([one["seconds"] for one in runs])
             print(
-                f"{build.__name__}, {draws} draws: beyond 3 errors {beyond} of {n_seeds}, "
+                f"{target}, {draws} draws: beyond 3 errors {beyond} of {n_seeds}, "
                 f"{(off & ~marked).sum()} of them not marked; marked in all {marked.sum()}; "
                 f"{seconds:.1f} CPU s",
                 flush=True,
@@ -103,4 +133,5 @@ def main(n_seeds: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    *targets, n_seeds = sys.argv[1:]
+    main(targets or list(TARGETS), int(n_seeds))

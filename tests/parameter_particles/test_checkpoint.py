@@ -87,6 +87,9 @@ def test_a_checkpoint_of_another_run_is_refused(tmp_path):
     refused("observed and other data: the checkpoint has", model=other)
     refused("; model: the checkpoint has|another run: model: ", model=model(psf.UKF(), 3))
     refused('inner: the checkpoint has "", this run has "UKF', inner=psf.UKF())
+    refused('screen: the checkpoint has "", this run has "UKF', screen=psf.UKF())
+    refused("populations: the checkpoint has 2, this run has 3", populations=3)
+    refused("waste_free: the checkpoint has true, this run has false", waste_free=False)
 
 
 def test_rivals_have_folders_of_their_own(tmp_path, often, monkeypatch):

@@ -113,6 +113,24 @@ def test_members_are_doubled_and_the_stored_estimates_are_theirs(by_filter):
     np.testing.assert_allclose(stats["lp"].values.ravel(), recomputed, rtol=1e-9)
 
 
+@pytest.mark.filterwarnings("ignore:the log-evidence")  # few particles
+def test_every_update_of_a_filter_is_counted(monkeypatch):
+    """Those of moves, of the variance at fixed parameters and of doubled members too."""
+    filtered, made = ObservedRows.filtered, []
+
+    def counted(rows, x, seeds, states, begin, end):
+        made.append(len(x) * (end - begin))
+        return filtered(rows, x, seeds, states, begin, end)
+
+    monkeypatch.setattr(ObservedRows, "filtered", counted)
+    found = psf.sample_smc(
+        20, model=model(psf.BootstrapPF(6), 12), data="sequential", populations=2, random_seed=2,
+        progressbar=False, compute_convergence_checks=False,
+    )["smc"]  # fmt: skip
+    assert found["n_members"][-1] > 6
+    assert found["n_updates"].sum() == sum(made)
+
+
 def test_members_are_judged_by_the_variance_at_fixed_parameters():
     """Not by that over parameters, which is larger."""
     rows, rng = ObservedRows.of(model(psf.BootstrapPF(50), 5)), np.random.default_rng(1)
