@@ -155,6 +155,19 @@ def test_only_operations_that_are_needed_count(monkeypatch):
     assert lowering.n_operations([value]) == 2
 
 
+def test_a_graph_of_many_small_operations_may_have_more(monkeypatch):
+    """Array code takes its time for each of them, however few scalars it has."""
+    monkeypatch.setattr(lowering, "MAX_EXPRESSIONS", 20)
+    monkeypatch.setattr(lowering, "MANY_NODES", 10)
+    x = y = pt.tensor("x", shape=(1,), dtype="float64")
+    for _ in range(15):
+        y = pt.sin(y) + x
+    lowering.unrolled(Graph({"theta": x}, [y]))
+    wide = pt.tensor("wide", shape=(15,), dtype="float64")
+    with pytest.raises(lowering.NotUnrollableError, match="more than 20 scalar"):
+        lowering.unrolled(Graph({"theta": wide}, [pt.sin(wide) + wide]))
+
+
 def test_a_function_of_many_results_becomes_machine_code_in_its_callers_only():
     """Alone, the code of the 1700 constants of forty states took 40 CPU seconds."""
     theta = pt.tensor("theta", shape=(2,), dtype="float64")

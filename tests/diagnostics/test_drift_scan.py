@@ -192,7 +192,7 @@ def test_data_are_simulated_at_the_posterior_mode():
         pm.Normal("gain", 0, 2)
         psf.StateSpace("d", driven(), psf.EKF(), steps=STEPS, inputs=FORCE, observed=simulated(1))
     variable = ScoredVariable(model, "d")
-    start = np.array([0.2, np.log(0.3), 1.0])
+    start = np.array([0.4, np.log(0.3), 1.0])
     test = ConstancyTest(variable, TimeAxis.of(model, variable).durations, start)
     at = test.variable.labels.index("a")
     assert variable.theta(test.mode.x).reshape(-1, len(variable.labels))[0, at] == pytest.approx(

@@ -7,11 +7,13 @@ import pymc as pm
 import pytensor.tensor as pt
 import pytest
 import xarray as xr
+from numba import njit
 from scipy.stats import norm, poisson
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.filters.markov_chain.backward import _add
 from pymc_statespace_filters.filters.outcomes import Failure
 from pymc_statespace_filters.filters.recommendation import exact_filter
 from pymc_statespace_filters.filters.signatures import PANEL
@@ -156,6 +158,19 @@ def test_gradient_where_a_probability_is_zero():
         for p in (0.0, h, 2 * h)
     ]
     np.testing.assert_allclose(found, (4 * value[1] - value[2] - 3 * value[0]) / (2 * h), rtol=1e-5)
+
+
+def test_what_has_no_weight_has_no_derivative():
+    """Though that of the log-density of an impossible observation is infinite."""
+
+    @njit
+    def added(derivatives, weights):
+        theta_bar = np.ones(2)
+        _add(np.array([1]), derivatives, weights, theta_bar)
+        return theta_bar
+
+    found = added(np.array([[np.inf, 2.0]]), np.array([0.0, 3.0]))
+    np.testing.assert_array_equal(found, [1.0, 7.0])
 
 
 def test_two_thousand_observations():

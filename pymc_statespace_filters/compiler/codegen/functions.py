@@ -19,6 +19,7 @@ from numba.core.typing import signature
 from numba.extending import intrinsic
 from numba.np.arrayobj import load_item, make_array
 from pytensor.graph.basic import Variable
+from pytensor.graph.traversal import io_toposort
 
 from ..native.cache_key import key_of
 from .array_fallback import array_member_function, array_vector_function
@@ -35,6 +36,10 @@ _LOG = logging.getLogger("pymc_statespace_filters")
 # a full matrix of parameters has 27000 operations and takes 22 s. Array code takes 40 s for the EKF
 # of 12 states and 50 s for 20, and runs seventeen times slower there. CPU seconds of a first call.
 MAX_EXPRESSIONS = 30_000
+# In a graph of at most so many operations on arrays; in a larger one in proportion, because array
+# code takes 10 ms or more to compile for each: of 13000 operations on arrays, 49000 on scalars, it
+# was not compiled after 85 s, and was written out in 15 s.
+MANY_NODES = 3000
 TRIED = 5  # times as many may be tried, at 20 us each: some turn out not to be needed
 MAX_OUTPUT_ELEMENTS = 2000  # of a state of the EKF with 60 states: mean and covariance
 
@@ -52,11 +57,13 @@ def unrolled(graph: Graph) -> list[list[Value]]:
         raise NotUnrollableError(f"more than {MAX_OUTPUT_ELEMENTS} numbers")
     arena = Arena()
     values = [_input_elements(arena, name, v) for name, v in graph.inputs.items()]
-    most = TRIED * MAX_EXPRESSIONS
-    arrays = unroll(arena, list(graph.inputs.values()), values, graph.outputs, most)
+    inputs = list(graph.inputs.values())
+    n_nodes = len(io_toposort(inputs, graph.outputs))
+    most = int(MAX_EXPRESSIONS * max(1.0, n_nodes / MANY_NODES))
+    arrays = unroll(arena, inputs, values, graph.outputs, TRIED * most)
     lists = [list(np.atleast_1d(a)) for a in arrays]
-    if n_operations(v for group in lists for v in group) > MAX_EXPRESSIONS:
-        raise NotUnrollableError(f"more than {MAX_EXPRESSIONS} scalar operations")
+    if n_operations(v for group in lists for v in group) > most:
+        raise NotUnrollableError(f"more than {most} scalar operations")
     return lists
 
 
