@@ -13,6 +13,9 @@
 and prints, of so many records, for each candidate whether it is there, its probability with its
 error, and the other number with its error; then CPU seconds of the two ways, and the mean z^2 of
 the differences of probabilities between 0.02 and 0.98.
+
+``chain``, record 1: probabilities of the three dampers that are there 0.995, 0.947 and 0.978, of
+the others 0.209 and 0.486; mean z^2 0.7.
 """
 
 import logging

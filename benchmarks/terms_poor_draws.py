@@ -8,6 +8,10 @@ how many of these had no error to warn of (false alarms), how many were wrong wi
 point of the proposal that they gave, and of the one in use.
 
 An inclusion is wrong if it is off by more than four of its standard errors and 0.01.
+
+Regression 1 without the last kind, and regression 2, are 25 cases. Two were wrong, with draws off
+by 100 standard deviations, and warned; none was silent. Of the 23 that were right two warned (10
+times as wide, off by 6), and none of the eight with good draws. Their largest error was 0.008.
 """
 
 import sys

@@ -15,7 +15,10 @@ from .proposals import Guide
 from .screening import N_PILOT, Announce, improved, is_worthless, proposals_of
 from .unused import Uses
 
-POOR = 0.1  # effective points per point of the full model, below which the draws are replaced
+# Effective points per point of the full model, below which the draws are replaced. Draws of the
+# posterior have 0.1 to 0.6; those that are off by six standard deviations 0.005
+# (`benchmarks.terms_poor_draws`).
+POOR = 0.1
 N_ROUNDS, N_POINTS = 8, 2000  # of replacing them, and points of the full model for that
 
 
