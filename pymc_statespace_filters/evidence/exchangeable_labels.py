@@ -78,7 +78,28 @@ class Scalars(NamedTuple):
         return {**points, **changed}
 
 
-type Place = Axis | Scalars
+class Share(NamedTuple):
+    """The share w of the first of two labels; the other one has 1 - w."""
+
+    name: str
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The variable that has the labels."""
+        return (self.name,)
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """What no other labels may have."""
+        return (self.name,)
+
+    def permuted(self, points: Draws, order: NDArray[np.int64]) -> Draws:
+        """The points with other labels."""
+        share = points[self.name]
+        return {**points, self.name: share if order[0] == 0 else 1.0 - share}
+
+
+type Place = Axis | Scalars | Share
 
 
 @dataclass(frozen=True)
@@ -179,7 +200,14 @@ def _places_by_count(draws: Draws, alike: Sequence[Sequence[str]]) -> dict[int, 
             groups = [Scalars(some) for some in combinations(names, count)]
             if len(groups) + len(found.get(count, [])) <= MOST_PLACES:
                 found.setdefault(count, []).extend(groups)
+    shares = [Share(name) for name, values in draws.items() if _is_share(values)]
+    if 2 in found and len(shares) + len(found[2]) <= MOST_PLACES:
+        found[2].extend(shares)
     return found
+
+
+def _is_share(values: Array) -> bool:
+    return values.ndim == 1 and bool(((values > 0.0) & (values < 1.0)).all())
 
 
 def _invariant_places(
@@ -267,6 +295,8 @@ def _features(draws: Draws, places: Sequence[Place]) -> Array:
         for place in places
         if isinstance(place, Scalars)
     ]
+    shares = [draws[place.name] for place in places if isinstance(place, Share)]
+    columns += [np.stack([share, 1.0 - share], axis=1)[:, :, np.newaxis] for share in shares]
     for name in dict.fromkeys(axis.name for axis in axes):
         numbers = [axis.number + 1 for axis in axes if axis.name == name]
         values = np.moveaxis(draws[name], numbers, range(1, 1 + len(numbers)))

@@ -104,6 +104,35 @@ def test_an_order_that_is_half_of_an_asymmetric_prior_is_improper():
         assert evidences(idata, mixture((-1.0, 1.5), ORDERED), "bridge")["bridge"].improper == "mu"
 
 
+@pytest.mark.parametrize("of_second", [0.0, 0.5])
+def test_a_share_is_that_of_the_other_label_in_exchange(of_second):
+    """Of a mixture with the weights w and 1 - w; without symmetry it has no labels."""
+    rng, shape = np.random.default_rng(4), (2, 200)
+    names = {"first": -2.0, "second": 2.0}
+    draws = {
+        name: (("chain", "draw"), mean + 0.3 * rng.standard_normal(shape))
+        for name, mean in names.items()
+    }
+    draws["w"] = (("chain", "draw"), rng.beta(8, 4, shape))
+    idata = xr.DataTree.from_dict({"posterior": xr.Dataset(draws)})
+    with pm.Model() as model:
+        means = [pm.Normal(name, 0, 3) for name in names]
+        w = pm.Beta("w", 2, 2)
+        weights = [w, 1 - w + of_second]
+        of_each = [
+            pt.log(weight) + pm.logp(pm.Normal.dist(mean, 1), DATA)
+            for weight, mean in zip(weights, means, strict=True)
+        ]
+        pm.Potential("likelihood", pt.logaddexp(*of_each).sum())
+    found = exchangeable_labels(model, idata, np.zeros(shape), rng)
+    if of_second:
+        assert not found
+    else:
+        (labels,) = found
+        assert labels.names == ["first", "second", "w"]
+        assert labels.lacking == pytest.approx(np.log(2))
+
+
 def test_three_labels_of_which_two_change_places():
     rng = np.random.default_rng(3)
     mu = np.array([-5.0, 5.0, 5.1]) + 0.3 * rng.standard_normal((2, 500, 3))
