@@ -6,6 +6,7 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 from numpy.typing import NDArray
+from pymc.distributions.continuous import InterpolatedRV
 from pymc.pytensorf import collect_default_updates, reseed_rngs
 from pymc.pytensorf import compile as compile_pymc
 from pytensor.compile.builders import OpFromGraph
@@ -17,7 +18,8 @@ from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
 _AT_ONCE = 100  # draws, whose covariances, for one, are all in memory
-# Where the distributions are defined that draw arrays of any size, from arrays of parameters.
+# Where the distributions are defined that draw arrays of any size, from arrays of parameters: all
+# but `Interpolated`.
 _KNOWN = "pytensor.tensor.random.basic", "pymc.distributions.continuous"
 
 Array = NDArray[np.float64]
@@ -39,7 +41,8 @@ class PriorDraws:
         first = _first_parameters(mapped)
         self._is_joint = bool(first)
         zeros = pt.vector("zeros")  # one for each draw
-        joint = {x: x + zeros.reshape((-1, *[1] * x.type.ndim)) for x in first}
+        # Of the type of each, which may be that of an index.
+        joint = {x: x + zeros.reshape((-1, *[1] * x.type.ndim)).astype(x.type.dtype) for x in first}
         outputs = vectorize_graph(mapped, joint) if joint else [x[None] for x in mapped]
         # Machine code would take seconds to compile, and save little.
         self._function = compile_pymc(
@@ -70,11 +73,14 @@ def _first_parameters(outputs: Sequence[Variable]) -> list[Variable]:
         return []
     random = [node for node in nodes if isinstance(node.op, RandomVariable)]
     drawn = {output for node in random for output in node.outputs}
+    if drawn & set(ancestors([node.op.size_param(node) for node in random])):
+        return []  # a vectorised shape has a value for each draw
     first = [node.op.dist_params(node)[0] for node in random]
     return [x for x in first if not drawn & set(ancestors([x]))]
 
 
 def _is_known(node: Apply) -> bool:
     if isinstance(node.op, RandomVariable):
-        return type(node.op).__module__ in _KNOWN and bool(node.op.dist_params(node))
+        is_known = type(node.op).__module__ in _KNOWN and not isinstance(node.op, InterpolatedRV)
+        return is_known and bool(node.op.dist_params(node))
     return not isinstance(node.op, OpFromGraph | Scan)

@@ -65,6 +65,38 @@ def test_many_draws_in_one_call_are_one_call_for_each(model, draws, is_known, mo
         np.testing.assert_array_equal(found, draws[:150])
 
 
+def _interpolated():
+    grid = np.linspace(0, 1, 5)
+    pm.Normal("x", pm.Interpolated("middle", grid, 1 + grid), 1)
+
+
+def _with_a_shape_of_another():
+    middle = pm.Normal("middle", [0.0, 10.0], 1)
+    pm.Normal("x", middle[0], 1, shape=middle.shape)
+
+
+def _with_a_number_that_is_an_index():
+    group = pm.Data("group", [0, 1, 1])
+    pm.Normal("x", pm.Normal("middle", [0.0, 10.0], 1)[group], 1)
+    pm.Normal("y", group, 1)
+
+
+@pytest.mark.parametrize(
+    ("build", "is_joint"),
+    [(_interpolated, False), (_with_a_shape_of_another, False),
+     (_with_a_number_that_is_an_index, True)],
+)  # fmt: skip
+def test_what_pytensor_does_not_draw_many_times_in_one_call(build, is_joint, monkeypatch):
+    with pm.Model() as model:
+        build()
+    draws = PriorDraws(model, model.free_RVs)
+    assert draws._is_joint == is_joint
+    monkeypatch.setattr(prior_draws, "_first_parameters", lambda outputs: [])
+    alone = PriorDraws(model, model.free_RVs)
+    found, expected = (one(5, np.random.default_rng(1)) for one in (draws, alone))
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
 def test_columns_and_rows_are_independent_where_the_law_says_so(draws):
     """Six correlations, each within 4 standard errors: 0.04 per cent fail if all is right."""
     share, upper = expit(draws[:, 1]), draws[:, 0]
