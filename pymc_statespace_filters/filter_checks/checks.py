@@ -18,8 +18,9 @@ from ..filters.rbpf import RBPF
 from ..filters.recommendation import check_system_and_filter, short_form
 from ..progress import row_progress
 from ..pymc_model.density import compile_raveled
+from ..pymc_model.elements import element_names
 from ..pymc_model.filter_estimates import VariableAtPoints
-from ..pymc_model.inspection import element_names, log_density_terms, state_space_nodes
+from ..pymc_model.inspection import log_density_terms, state_space_nodes
 from ..pymc_model.posterior_draws import posterior_group, unconstrained_draws
 from .bias import bias_at_draws, bias_elsewhere
 from .budget import Budget

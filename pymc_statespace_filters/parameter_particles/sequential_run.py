@@ -135,9 +135,10 @@ def _check_row(rows: ObservedRows, cloud: Cloud, row: int) -> None:
     shown = rows.shown_times[row]
     values = rows.record.observed[row].tolist()
     raise ModelError(
-        f"observed[{row}] = {values} at {shown} has likelihood zero at all but {n_alive} of "
-        f"{len(cloud.pilot.particles.x)} particles of the pilot, of which {least} are needed, and "
-        f"at all but {cloud.others.n_alive.sum()} of the populations: correct the row, widen the "
+        f"observed[{row}] = {values} at {shown} has a likelihood above zero at {n_alive} of "
+        f"{len(cloud.pilot.particles.x)} particles of the pilot population, where {least} are "
+        f"needed, and at {cloud.others.n_alive.sum()} of {len(cloud.others.particles.x)} of the "
+        "other populations: correct the row (counts are whole numbers from 0), widen the "
         "noise of the system, or raise draws"
     )
 

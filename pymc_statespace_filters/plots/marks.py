@@ -148,9 +148,10 @@ def _dim_of(da: xr.DataArray, *others: str) -> Hashable:
 
 def _broken_line(x: Any, y: Any, target: Any, **kwargs: Any) -> Any:
     """Draw the columns of y against those of x as one line with gaps."""
-    gaps = np.full((1, np.shape(x)[1]), np.nan)
-    x, y = (np.concatenate([values, gaps]).T.ravel() for values in (x, y))
-    return backend_from_object(target).line(x, y, target, **kwargs)
+    x, y = np.asarray(x), np.asarray(y)
+    x = np.concatenate([x, x[-1:]])  # numbers or dates; y alone breaks the line
+    y = np.concatenate([y, np.full((1, y.shape[1]), np.nan)])
+    return backend_from_object(target).line(x.T.ravel(), y.T.ravel(), target, **kwargs)
 
 
 def path_xy(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:

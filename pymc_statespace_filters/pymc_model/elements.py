@@ -5,13 +5,14 @@ dimensions, ``"k[z^3]"``, as ArviZ labels it. The vector itself names all of the
 """
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
 import numpy as np
 import pymc as pm
+from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
 
@@ -79,6 +80,19 @@ class Elements:
             f"{argument} must name free variables of the model, or elements of them, got {name!r}: "
             f"{what}"
         )
+
+
+def element_names(model: pm.Model, values: Sequence[TensorVariable] | None = None) -> list[str]:
+    """Name each element of the flat vector of some values, such as "k[z^3]" or "theta[1]".
+
+    Default: those of the free variables, in their order.
+    """
+    point = model.initial_point()
+    return [
+        label
+        for value in values or [model.rvs_to_values[rv] for rv in model.free_RVs]
+        for label in _labels(model.values_to_rvs[value].name, point[value.name].shape, model)[0]
+    ]
 
 
 def _labels(name: str, shape: tuple[int, ...], model: pm.Model) -> tuple[list[str], list[str]]:

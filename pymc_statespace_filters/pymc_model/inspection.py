@@ -26,7 +26,9 @@ from .random_variable import PanelRV, StateSpaceRV
 def given_model(model: pm.Model | None) -> pm.Model:
     """The model, or that of the ``with`` block; a `ModelError` if it is something else."""
     if not isinstance(model, pm.Model | None):
-        raise ModelError(f"model must be a pymc.Model, got {type(model).__name__}")
+        is_number = isinstance(model, int | np.integer)
+        advice = f" {model}: give a number by name, such as n_steps={model}" if is_number else ""
+        raise ModelError(f"model must be a pymc.Model, got {type(model).__name__}{advice}")
     found = pm.Model.get_context(error_if_none=False) if model is None else model
     if found is None:
         raise ModelError("model must be given outside a `with` block of a model, got None")
@@ -87,19 +89,6 @@ def log_density_terms(model: pm.Model) -> list[tuple[str, TensorVariable]]:
     """The terms of a model's log-density, each with the name of its variable."""
     names = [variable.name for variable in [*model.basic_RVs, *model.potentials]]
     return list(zip(names, model.logp(sum=False), strict=True))
-
-
-def element_names(model: pm.Model, values: Sequence[TensorVariable] | None = None) -> list[str]:
-    """Name each element of the flat vector of some values, such as "theta[1]".
-
-    Default: those of the free variables, in their order.
-    """
-    point = model.initial_point()
-    return [
-        model.values_to_rvs[value].name + (f"[{', '.join(map(str, index))}]" if index else "")
-        for value in values or [model.rvs_to_values[rv] for rv in model.free_RVs]
-        for index in np.ndindex(point[value.name].shape)
-    ]
 
 
 def noise_seeds(model: pm.Model) -> dict[str, SharedVariable]:

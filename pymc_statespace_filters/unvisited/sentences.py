@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..pymc_model.density import ConstrainedValues
-from ..pymc_model.inspection import element_names
+from ..pymc_model.elements import element_names
 from .check import MissedTail, missed_tails
 from .tail_proposals import Evaluate
 

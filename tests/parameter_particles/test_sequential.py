@@ -314,7 +314,7 @@ def test_values_of_data_are_part_of_the_model():
 def test_a_row_that_is_impossible_is_named():
     built = model(psf.EKF(), 3)
     first = psf.sample_smc(model=built, **SETTINGS | {"draws": 20, "populations": 2})
-    with pytest.raises(ModelError, match=r"observed\[3\] = \[1e\+200\] at 4.* all but 0 of"):
+    with pytest.raises(ModelError, match=r"observed\[3\] = \[1e\+200\] at 4.* above zero at 0 of"):
         psf.extend(first, built, observed=[1e200], steps=[4], progressbar=False)
 
 

@@ -34,6 +34,17 @@ def test_states_at_observations_are_bars_with_nothing_between(states):
     assert np.isnan(ends[:, 2]).all()
 
 
+def test_states_at_a_few_dates_are_bars(states):
+    dates = np.datetime64("2024-01-07", "us") + 7 * np.arange(TIMES.size).astype("m8[D]")
+    group = states["filtered_states"].to_dataset()
+    dates = dates[: group.sizes["d_time"]]
+    tree = xr.DataTree.from_dict({"filtered_states": group.assign_coords(d_time=dates)})
+    bar = drawn(plot_states(tree, backend="none"), "bar_90")["position"]
+    np.testing.assert_array_equal(np.asarray(bar["x"])[::3], dates)
+    np.testing.assert_allclose(np.asarray(bar["y"])[::3], SINE[::5] - 99 * 0.95)
+    assert np.isnan(np.asarray(bar["y"])[2::3]).all()
+
+
 def test_the_record_is_in_the_panel_of_its_state(states):
     (point,) = [p for p in drawn(plot_states(states, backend="none"), "data").values() if p]
     seen = np.delete(np.arange(9), 3)  # what is missing is no point

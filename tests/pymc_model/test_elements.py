@@ -4,12 +4,12 @@ import pymc as pm
 import pytest
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.pymc_model.elements import Elements
+from pymc_statespace_filters.pymc_model.elements import Elements, element_names
 
 COORDS = {"term": ["1", "z^3"], "side": ["left", "right"], "year": [1, 2]}
 
 
-def elements():
+def a_model():
     with pm.Model(coords=COORDS) as model:
         model.add_coord("plain", length=2)
         pm.Normal("k", dims=("term", "side"))
@@ -18,7 +18,11 @@ def elements():
         pm.Normal("a", dims="year")
         pm.Normal("c", dims="plain")
         pm.Dirichlet("p", [1.0, 1.0, 1.0])
-    return Elements.of(model)
+    return model
+
+
+def elements():
+    return Elements.of(a_model())
 
 
 def test_labels_are_those_of_arviz():
@@ -27,6 +31,13 @@ def test_labels_are_those_of_arviz():
     rest = ["sigma", "b[0]", "b[1]", "a[1]", "a[2]", "c[0]", "c[1]", "p[0]", "p[1]"]
     assert list(found.labels) == k + rest
     assert found.variables[3:6] == ("k", "sigma", "b")
+
+
+def test_messages_name_elements_of_some_variables_so():
+    model = a_model()
+    values = [model.rvs_to_values[model[name]] for name in ("p", "a")]
+    assert element_names(model, values) == ["p[0]", "p[1]", "a[1]", "a[2]"]
+    assert tuple(element_names(model)) == Elements.of(model).labels
 
 
 @pytest.mark.parametrize(

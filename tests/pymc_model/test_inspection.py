@@ -155,3 +155,8 @@ def test_noisy_filters_and_their_sizes():
 def test_draws_and_model_in_the_wrong_order(function, settings):
     with pytest.raises(ModelError, match=r"model must be a pymc.Model, got DataTree"):
         function(pm.Model(), xr.DataTree(), **settings)
+
+
+def test_a_number_in_place_of_the_model_is_told_how_to_be_given():
+    with pytest.raises(ModelError, match=r"got int 10: give a number by name, such as n_steps=10"):
+        psf.forecast(xr.DataTree(), 10)

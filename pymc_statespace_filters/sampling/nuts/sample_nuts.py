@@ -12,7 +12,8 @@ from xarray import DataTree
 
 from ...errors import ModelError
 from ...parallel.cpu_affinity import available_cores
-from ...pymc_model.inspection import element_names, exactness, filters_used
+from ...pymc_model.elements import element_names
+from ...pymc_model.inspection import exactness, filters_used
 from ..output.datatree import to_datatree
 from ..output.filter_check import FilterCheck, check_filters, warn_of_filters
 from ..output.unvisited import unvisited_warnings

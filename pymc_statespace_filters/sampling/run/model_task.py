@@ -12,7 +12,8 @@ from pymc.stats.convergence import SamplerWarning, WarningType, log_warnings
 from xarray import DataTree
 
 from ...parallel.communicator import Communicator
-from ...pymc_model.inspection import element_names, filters_used
+from ...pymc_model.elements import element_names
+from ...pymc_model.inspection import filters_used
 from ..checkpoint.checkpoint import Checkpoint
 from ..kernel.state import ChainState, Draws, side_generator
 from ..output.convergence import Convergence, convergence
