@@ -12,10 +12,11 @@ when the first steps are over begins again there.
 The proposal density of a sub-model is fitted when it is first met, from points of its own, and
 stays. All weights together then give the evidences of all sub-models that were met, and
 probabilities renormalised over these, which have smaller errors than frequencies of visits but know
-nothing of what was not met.
+nothing of what was not met. How much that is, what one chain visits and no other has met tells.
 """
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,7 +116,8 @@ def run_chains(
 ) -> Visits:
     """Let several chains walk over the sub-models, in step with each other."""
     met = _Met(prior, guide, uses, sampler, rng)
-    at = _starts(prior, guide)
+    at, seen = _starts(prior, guide), _Seen()
+    seen.note(range(N_CHAINS), at)
     height = met.heights(at)
     visited = np.empty((N_CHAINS, N_STEPS, at.shape[1]), dtype=bool)
     announce("chains over sub-models", N_CHAINS * N_STEPS * FEWEST)
@@ -123,6 +125,7 @@ def run_chains(
         proposed = np.array([_moved(one, prior.is_open, rng) for one in at])
         tried = np.flatnonzero((proposed != at).any(axis=1) & prior.permits(proposed))
         new = met.heights(proposed[tried]) if tried.size else np.empty(0)
+        seen.note(tried, proposed[tried])
         accepted = np.log(rng.random(len(tried))) < new - height[tried]
         at[tried[accepted]] = proposed[tried[accepted]]
         height[tried[accepted]] = new[accepted]
@@ -130,11 +133,36 @@ def run_chains(
         if step == N_DROPPED - 1:
             lost = np.flatnonzero(met.lost(at))
             at[lost] = met.best
+            seen.note(lost, at[lost])
             height[lost] = met.heights(at[lost]) if lost.size else height[lost]
     kept = visited[:, N_DROPPED:].astype(float)
     error = [mcse_of_chains(one) if np.ptp(one) else 0.0 for one in np.moveaxis(kept, -1, 0)]
-    sets = np.array([one.proposal.present for one in met.points.values()])
-    return Visits(sets, list(met.points.values()), kept.mean(axis=(0, 1)), np.array(error))
+    alone = seen.alone(visited[:, N_DROPPED:])
+    points = list(met.points.values())
+    return Visits(
+        sets=np.array([one.proposal.present for one in points]),
+        points=points,
+        frequency=kept.mean(axis=(0, 1)),
+        error=np.array(error),
+        alone=alone.mean(axis=1),
+        frequency_alone=(alone[..., None] * kept).mean(axis=1),
+    )
+
+
+class _Seen:
+    """Which chains have met a sub-model."""
+
+    def __init__(self) -> None:
+        self._chains: defaultdict[bytes, set[int]] = defaultdict(set)
+
+    def note(self, chains: Iterable[int], sets: Sets) -> None:
+        """Each of these chains has met one of the sub-models (m, K)."""
+        for chain, one in zip(chains, sets, strict=True):
+            self._chains[one.tobytes()].add(int(chain))
+
+    def alone(self, visited: Sets) -> NDArray[np.bool_]:
+        """Whether no other chain has met what a chain has visited, of visits (chain, step, K)."""
+        return np.array([[len(self._chains[one.tobytes()]) == 1 for one in of] for of in visited])
 
 
 def _moved(present: Sets, is_open: Sets, rng: np.random.Generator) -> Sets:

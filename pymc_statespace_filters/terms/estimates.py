@@ -113,12 +113,27 @@ class Visits:
         All points of each.
     frequency, error : ndarray (K,)
         How often each term was present, and the standard error.
+    alone : ndarray (C,)
+        The share of the visits of each chain to sub-models that no other chain has met.
+    frequency_alone : ndarray (C, K)
+        How often a visit was such a one, with the term present.
     """
 
     sets: Sets
     points: list[Weighted]
     frequency: Array
     error: Array
+    alone: Array
+    frequency_alone: Array
+
+    def missed(self, inclusion: Array) -> Array:
+        """How far sub-models that were not met may move inclusions (K,).
+
+        What the other chains have missed of the visits of one is about as much as all have missed
+        of the posterior, or more.
+        """
+        moved = self.frequency_alone - self.alone[:, None] * inclusion
+        return np.asarray(np.sqrt((moved**2).mean(axis=0)))
 
 
 class Sampler:

@@ -29,12 +29,15 @@ class Probabilities:
         The terms of the sub-models.
     log_prior, log_evidence, error : ndarray (S,)
         Of the sub-models; the relative standard errors of the evidences.
+    missed : ndarray (K,), optional
+        How far sub-models that are not among these may move the inclusions.
     """
 
     present: Sets
     log_prior: Array
     log_evidence: Array
     error: Array
+    missed: Array | float = 0.0
 
     @cached_property
     def of_models(self) -> Array:
@@ -55,7 +58,8 @@ class Probabilities:
     @cached_property
     def inclusion_se(self) -> Array:
         """Their standard errors, (K,)."""
-        return np.asarray(np.sqrt(self._uncertain**2 @ (self.present - self.inclusion) ** 2))
+        variance = self._uncertain**2 @ (self.present - self.inclusion) ** 2
+        return np.asarray(np.sqrt(variance + self.missed**2))
 
     @property
     def pairs(self) -> Array:

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -133,7 +134,8 @@ def select_terms(
     over the sub-models, adding, dropping and swapping terms. With estimates that are unbiased and
     made anew for each proposal their law is exactly the posterior (Andrieu and Roberts 2009):
     ``visits`` in ``terms``, with ``visits_se``, are the frequencies. ``inclusion`` has the smaller
-    errors, but is relative to the sub-models that were met, which are those in ``models``.
+    errors, but is relative to the sub-models that were met, which are those in ``models``. Its
+    error contains what one chain has visited and no other has met.
 
     Variables that only absent terms use have their prior: the scale of the slabs, the gap of a
     spring that is not there.
@@ -196,6 +198,8 @@ def select_terms(
                     visits.points, sets, prior.log_weight(sets), sampler, announce
                 )
         found = probabilities(points, sets, prior.log_weight(sets))
+        if visits is not None:
+            found = replace(found, missed=visits.missed(found.inclusion))
         count = like.sizes["chain"] * like.sizes["draw"]
         drawn = averaged(points, found.of_models, count, rng)
         tree = as_datatree(found, points, prior.restriction(rng), visits, drawn, density, idata)

@@ -100,9 +100,7 @@ def _with_bounds(
     has_points = np.array([len(one.x) > 0 for one in points])
     means = [one.mean for one in points]
     value = np.array([one.value for one in means]) + np.where(has_points, 0.0, more)
-    scaled = Probabilities(
-        found.present, found.log_prior, value, np.array([one.error for one in means])
-    )
+    scaled = replace(found, log_evidence=value, error=np.array([one.error for one in means]))
     return scaled, scaled.of_models * ~has_points
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from pymc_statespace_filters.terms import chain
 from pymc_statespace_filters.terms.inclusion import InclusionPrior
+from pymc_statespace_filters.terms.probabilities import Probabilities
 
 LOG_POSTERIOR = np.log([[0.2, 0.05], [0.3, 0.45]])  # by the presence of two terms
 INCLUSION = [0.75, 0.5]
@@ -39,3 +40,43 @@ def test_visits_are_as_frequent_as_probable(sd, monkeypatch):
     visits = chain.run_chains(prior, guide, None, None, rng, lambda task, total: None)
     assert (visits.error < 0.01).all()
     np.testing.assert_array_less(abs(visits.frequency - INCLUSION), 4 * visits.error)
+    assert not visits.alone.any()
+    np.testing.assert_array_equal(visits.missed(visits.frequency), 0.0)
+
+
+class Independent:
+    """Exact heights of terms that are present independently of each other."""
+
+    def __init__(self, log_odds):
+        self.log_odds, self.points = log_odds, {}
+        self.best = np.zeros(len(log_odds), dtype=bool)
+
+    def heights(self, sets):
+        for one in sets.copy():
+            self.points[one.tobytes()] = SimpleNamespace(proposal=SimpleNamespace(present=one))
+        return sets @ self.log_odds
+
+    def lost(self, sets):
+        return np.zeros(len(sets), dtype=bool)
+
+
+def test_what_was_not_met_is_part_of_the_error(monkeypatch):
+    """Of 2^16 sub-models, a few hundred: by evidences without error, of 12 runs."""
+    inclusion = np.concatenate([np.full(8, 0.05), np.full(8, 0.2)])
+    log_odds = np.log(inclusion / (1 - inclusion))
+    monkeypatch.setattr(chain, "N_STEPS", 400)
+    prior = InclusionPrior(None, np.zeros((16, 16), dtype=bool))
+    guide = SimpleNamespace(distances=np.linspace(0, 3, 16))
+    z, shares = [], []
+    for seed in range(12):
+        met = Independent(log_odds)
+        monkeypatch.setattr(chain, "_Met", lambda *args, met=met: met)
+        rng = np.random.default_rng(seed)
+        visits = chain.run_chains(prior, guide, None, None, rng, lambda task, total: None)
+        found = Probabilities(
+            visits.sets, visits.sets @ log_odds, *np.zeros((2, len(visits.sets)))
+        ).inclusion
+        shares.append(visits.alone.mean())
+        z.append((found - inclusion) / visits.missed(found))
+    assert 0.1 < np.median(shares) < 0.3
+    assert 0.5 < np.mean(np.square(z)) < 4.0
