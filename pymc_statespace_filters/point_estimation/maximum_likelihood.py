@@ -235,9 +235,13 @@ def _notes_on_rivals(peak: Peak, values: ConstrainedValues, errors: Array) -> It
 
 
 def _is_reordered(one: Array, other: Array, errors: Array) -> bool:
-    """Whether two points (n,) have the same numbers in different places, within their errors."""
+    """Whether two points (n,) have the same numbers in different places, within the other's errors.
+
+    A number has the error of the place that it has there: that of a parameter which is poorly
+    known would take others for equal.
+    """
     tolerance = np.where(np.isnan(errors), SAME_DIGITS * np.abs(other), SAME_ERRORS * errors)
-    differs = np.abs(one[:, None] - other) > np.maximum(tolerance[:, None], tolerance)
+    differs = np.abs(one[:, None] - other) > tolerance
     return not differs[linear_sum_assignment(differs)].any()
 
 

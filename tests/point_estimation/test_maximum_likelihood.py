@@ -184,6 +184,17 @@ def test_maxima_with_exchanged_labels_are_one():
     assert found.notes == ()
 
 
+def test_a_poorly_known_parameter_hides_no_maximum():
+    """Its standard error of 10 is larger than the differences between all numbers."""
+    with pm.Model() as model:
+        x, wide = pm.Uniform("x", -1.0, 1.0), pm.Normal("wide", 0.0, 20.0)
+        peaks = pt.logaddexp(-(((x - 0.1) / 0.02) ** 2) / 2, -(((x + 0.1) / 0.02) ** 2) / 2)
+        pm.Potential("likelihood", peaks - ((wide - 0.2) / 10) ** 2 / 2)
+    found = psf.maximum_likelihood(model, random_seed=1)
+    (note,) = found.notes
+    assert "0.00 nats lower" in note
+
+
 def test_a_scale_of_zero_has_no_standard_error():
     """The data scatter less than their errors explain."""
     y = np.array([0.3, -0.5, 0.8, 0.1, -0.2, 0.4])
