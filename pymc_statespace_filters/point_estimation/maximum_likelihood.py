@@ -11,7 +11,6 @@ import pandas as pd
 import pymc as pm
 from numpy.typing import NDArray
 from pymc.model import Model
-from scipy.optimize import linear_sum_assignment
 
 from ..errors import ModelError
 from ..evidence.estimators.newton import BatchFunction
@@ -20,6 +19,7 @@ from ..pymc_model.inspection import given_model
 from ..pymc_model.prior import ModelFactors
 from ..pymc_model.stepped import stepped_variables
 from ..sampling.starts.annealing import N_SWEEPS, Population
+from ..sampling.starts.modes import is_reordered
 from ..sampling.starts.population import population_of
 from ..system.checks import check_random_seed
 from .estimate import (
@@ -222,7 +222,8 @@ def _notes_on_rivals(peak: Peak, values: ConstrainedValues, errors: Array) -> It
     for point, value in peak.rivals:
         flat = flattened(values(point))
         if any(
-            abs(value - other) < SAME_NATS and _is_reordered(flat, numbers, errors)
+            abs(value - other) < SAME_NATS
+            and is_reordered(flat, numbers, _tolerance(numbers, errors))
             for numbers, other in known
         ):
             continue
@@ -234,15 +235,8 @@ def _notes_on_rivals(peak: Peak, values: ConstrainedValues, errors: Array) -> It
         yield f"another maximum, {peak.value - value:.2f} nats lower, is at {named}"
 
 
-def _is_reordered(one: Array, other: Array, errors: Array) -> bool:
-    """Whether two points (n,) have the same numbers in different places, within the other's errors.
-
-    A number has the error of the place that it has there: that of a parameter which is poorly
-    known would take others for equal.
-    """
-    tolerance = np.where(np.isnan(errors), SAME_DIGITS * np.abs(other), SAME_ERRORS * errors)
-    differs = np.abs(one[:, None] - other) > tolerance
-    return not differs[linear_sum_assignment(differs)].any()
+def _tolerance(numbers: Array, errors: Array) -> Array:
+    return np.where(np.isnan(errors), SAME_DIGITS * np.abs(numbers), SAME_ERRORS * errors)
 
 
 class Errors(NamedTuple):

@@ -22,7 +22,7 @@ def test_the_path_of_the_medians_and_draws(states):
     np.testing.assert_allclose(median["y"], SINE + 49.5)
     draws = only(collection, "draws")
     x, y = (np.asarray(draws[axis]).reshape(2, 42) for axis in "xy")
-    assert np.isnan(x[:, -1]).all()  # draws are not joined
+    assert np.isnan(y[:, -1]).all()  # draws are not joined
     np.testing.assert_allclose(x[:, :-1], np.add.outer([0, 99], COSINE))
     np.testing.assert_allclose(y[:, :-1], np.add.outer([0, 99], SINE))
     assert only(collection, "x_label")["string"] == "speed"

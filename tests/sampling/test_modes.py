@@ -47,6 +47,7 @@ def test_two_modes_are_reported_in_the_models_units(caplog):
         peak = np.log(weight / 0.05) + log_normal - 0.5 * (np.log(20) / 3) ** 2 - np.log(3)
         assert height == pytest.approx(peak + 2 * log_normal, abs=0.2)
     assert "flat" not in message
+    assert "another order" not in message
 
 
 def test_modes_are_reported_by_sample_dram_with_the_name_of_the_model(caplog):
@@ -54,6 +55,18 @@ def test_modes_are_reported_by_sample_dram_with_the_name_of_the_model(caplog):
     psf.run_models(models, draws=20, tune=20, random_seed=1, progressbar=False)
     (message,) = reported(caplog)
     assert message.startswith("Model 'two': The posterior has 2 separate modes")
+
+
+def test_modes_that_exchange_labels_are_called_so(caplog):
+    with pm.Model() as model:
+        means = pm.Normal("means", 0, 3, shape=2)
+        sds = pm.HalfNormal("sds", 1, shape=2)
+        halves = [pm.Normal.dist(means[i], sds[i]) for i in range(2)]
+        data = np.concatenate([-2 + 0.2 * np.arange(-3, 4), 2 + 0.4 * np.arange(-3, 4)])
+        pm.Mixture("d", [0.5, 0.5], halves, observed=data)
+    psf.find_starts(model, random_seed=1, progressbar=False)
+    (message,) = reported(caplog)
+    assert "same values in another order" in message
 
 
 def without_sign():
@@ -81,6 +94,7 @@ def test_the_lost_sign_of_a_state_is_reported(caplog):
     (message,) = reported(caplog)
     places = sorted(float(part.split(" ")[0]) for part in message.split("mean=")[1:])
     np.testing.assert_allclose(places, [-1.5, 1.5], atol=0.2)
+    assert "another order" not in message
 
 
 def banana():

@@ -5,7 +5,7 @@ one mode if the log-density between two points of theirs, close to each other, h
 curved posterior has several groups and one mode.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pymc.model import Model
 from pymc.stats.convergence import SamplerWarning, WarningType
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
 from ...pymc_model.density import ConstrainedValues
@@ -27,6 +28,13 @@ _DIP = 5.0  # nats below the lower end of each line, between separate modes
 _LEAST_SHARE = 0.02  # of the points; fewer have only not moved yet
 _APART = 2.0  # standard deviations within the modes: variables that differ between them
 _MOST_NAMED = 4  # variables in the message
+_N_COMPARED = 50  # points of each mode, whose means are compared
+
+_LABELS = (
+    " They have the same values in another order, as if labels were exchanged, such as those of "
+    "regimes. If they may be, the modes are one: keep an order of a vector of them "
+    "(transform=pm.distributions.transforms.ordered, initval=increasing values)."
+)
 
 Array = NDArray[np.float64]
 
@@ -104,10 +112,45 @@ def modes_message(model: Model, raveled: RaveledVariables, points: Points) -> st
         f"(share {shares[i]:.2f}, log-density {points.log_density[top]:.1f})"
         for i, top, value in zip(large, highest, values, strict=True)
     ]
+    of_modes = [[at(x) for x in points.x[some[:_N_COMPARED]]] for some in members]
+    advice = _LABELS if _are_orders(of_modes) else ""
     return (
         f"The posterior has {len(large)} separate modes: {' and '.join(described)}. A mean over "
-        "all modes may lie in none of them."
+        f"all modes may lie in none of them.{advice}"
     )
+
+
+def is_reordered(one: Array, other: Array, tolerance: Array) -> bool:
+    """Whether two points (n,) have the same numbers in different places, within the other's errors.
+
+    A number has the tolerance of the place that it has there: that of a parameter which is poorly
+    known would take others for equal.
+    """
+    differs = np.abs(one[:, None] - other) > tolerance
+    return not differs[linear_sum_assignment(differs)].any()
+
+
+def _are_orders(modes: Sequence[Sequence[Mapping[str, Array]]]) -> bool:
+    """Whether each mode, given by some of its points, has the values of the first, reordered.
+
+    Values change places within their variable, or among the scalar variables.
+    """
+    first, *others = modes
+    names = list(first[0])
+    scalars = [name for name in names if np.ndim(first[0][name]) == 0]
+    groups = [[name] for name in names if name not in scalars] + ([scalars] if scalars else [])
+    return all(_is_order(first, other, group) for other in others for group in groups)
+
+
+def _is_order(
+    one: Sequence[Mapping[str, Array]], other: Sequence[Mapping[str, Array]], names: list[str]
+) -> bool:
+    values = [
+        np.array([np.concatenate([np.ravel(x[name]) for name in names]) for x in mode])
+        for mode in (one, other)
+    ]
+    (first, second), spread = (x.mean(axis=0) for x in values), [x.std(axis=0) for x in values]
+    return is_reordered(first, second, np.maximum(*spread))
 
 
 def modes_warning(message: str) -> SamplerWarning:
