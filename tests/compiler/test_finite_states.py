@@ -119,6 +119,13 @@ def test_states_that_are_not_finite(transition, why):
     assert why in found.why_not["x0"]
 
 
+def test_nothing_is_known_of_a_step_that_is_not_written_out():
+    model = system(
+        lambda x, q: [q[0], x[0]], lambda x: [pm.Bernoulli.dist(pt.sigmoid(pt.sort(x)[0]))], 2
+    )
+    assert finite_states(model).indices == ()
+
+
 def test_declared_values():
     """They are reached although the start does not lead there, and no others may be."""
     model = system(lambda x, q: [x[0]], lambda x: [pm.Bernoulli.dist(0.5)], 1)

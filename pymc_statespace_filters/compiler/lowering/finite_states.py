@@ -248,7 +248,7 @@ class Given:
         """All combinations of values of the variables that are possible at each joint value."""
         rows = _Enumeration(self, states, np.arange(len(joint)), {})
         rows.given = {f"x.{i}": joint[:, k] for k, i in enumerate(known)}
-        for k in range(self.n_v):
+        for k in range(len(self.lower)):  # none is known of a step that is not written out
             rows.branch(k)
         return rows
 
