@@ -52,6 +52,8 @@ class Candidates:
 
     def numbers(self, key: Any, argument: str) -> list[int]:
         """The numbers of the candidates that an argument names: several for a whole vector."""
+        if key in self.keys:  # as results label it, whatever else that may stand for
+            return [self.keys.index(key)]
         named = {one for of in _columns(key, self.elements, argument) for one in of}
         found = [i for i, own in enumerate(self.switches.columns) if named.issuperset(own)]
         if sum(len(self.switches.columns[i]) for i in found) < len(named):

@@ -8,6 +8,7 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.states import ResumableRun
 from pymc_statespace_filters.parallel import threads
+from pymc_statespace_filters.parallel.threads import Pace
 from pymc_statespace_filters.pymc_model.filter_rows import FilterRows, Record
 
 SYSTEM = psf.StateSpaceModel(
@@ -86,3 +87,13 @@ def test_states_that_the_filter_has_not_left_are_refused(change):
         states = states[:, :-1].copy()
     with pytest.raises(ModelError, match="state of the filter"):
         rows(THETA[:17], NO_SEEDS[:17], states[:17], RECORD.rows(2, 7))
+
+
+def test_points_that_fail_at_once_do_not_make_work_short():
+    pace = Pace()
+    pace.measured(10, 1.0)
+    pace.measured(10, 1e-6)
+    assert not pace.is_short(10)
+    for _ in range(10):
+        pace.measured(10, 1e-6)
+    assert pace.is_short(10)

@@ -1,8 +1,10 @@
 """Which sub-models are within reach, and how many points go to which."""
 
 import numpy as np
+import pymc as pm
 
 from pymc_statespace_filters.terms import enumeration, screening
+from pymc_statespace_filters.terms.candidates import read_candidates
 from pymc_statespace_filters.terms.estimates import Weighted
 from pymc_statespace_filters.terms.probabilities import Probabilities
 
@@ -45,3 +47,12 @@ def test_errors_of_probabilities_are_those_of_uncertain_evidences():
     # Standard deviations of 20 000 draws are off by 3 % once in 10^9.
     np.testing.assert_allclose(found.inclusion_se, (p @ sets).std(axis=0), rtol=0.03)
     np.testing.assert_allclose(found.of_models_se, p.std(axis=0), rtol=0.03)
+
+
+def test_a_candidate_is_named_by_its_own_label():
+    """Which may be the position of another element."""
+    with pm.Model(coords={"power": [1, 2]}) as model:
+        pm.Normal("b", 0, 1, dims="power")
+    candidates = read_candidates(model, {"b": 0.0})
+    assert candidates.labels == ["b[1]", "b[2]"]
+    assert candidates.numbers("b[1]", "inclusion") == [0]
