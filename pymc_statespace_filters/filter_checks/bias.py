@@ -218,5 +218,6 @@ def _shift(name: str, shift: float, se: float, margin: float) -> Finding:
     outcome = OFF if abs(shift) - margin > _TOLERATED_SHIFT else FINE
     if outcome == FINE and abs(shift) + margin > VISIBLE:
         outcome = UNDECIDED
-    verdict = f"the posterior of {name} would move by {shift:+.1f} ± {se:.1f} sd without that"
+    moved = f"would move by {shift:+.1f} ± {se:.1f} sd if the filter were exact"
+    verdict = f"the posterior of {name} {moved}"
     return Finding(f"shift of {name}", shift, se, ALPHA, abs(shift) + margin, outcome, verdict)

@@ -13,6 +13,7 @@ from arviz_plots.visuals import labelled_x, line_x, scatter_x, set_xlim, set_xti
 
 from ..errors import ModelError
 from ..evidence import Evidence
+from ..system.checks import shortened
 from .canvas import (
     add_legend,
     annotate,
@@ -104,8 +105,9 @@ def _table(given: xr.DataTree | pd.DataFrame | Mapping[str, Evidence]) -> xr.Dat
         named = given.rename_axis(given.index.name or "model")
         return named[["log_evidence", "se"]].to_xarray()
     raise ModelError(
-        "idata_or_table must be a table of compare_evidence, a result of estimate_evidence or a "
-        f"DataTree with a group 'evidence', got {given!r}"
+        "idata_or_table must be a table of compare_evidence (which takes the results of several "
+        "models), a result of estimate_evidence or a DataTree with a group 'evidence', got "
+        f"{shortened(given)}"
     )
 
 
@@ -156,7 +158,7 @@ def plot_model_probabilities(
     >>> collection.savefig("probabilities.png")  # doctest: +SKIP
     """
     if not (isinstance(table, pd.DataFrame) and set(COLUMNS) <= set(table.columns)):
-        raise ModelError(f"table must be one of compare_evidence, got {table!r}")
+        raise ModelError(f"table must be one of compare_evidence, got {shortened(table)}")
     data = table.rename_axis("model")[list(COLUMNS)].to_xarray()
     prob, undecided = data[["prob"]], data["undecided"]
     low, high = (data[[end]].rename({end: "prob"}) for end in ("prob_low", "prob_high"))
