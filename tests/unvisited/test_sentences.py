@@ -97,3 +97,24 @@ def test_a_run_warns_and_keeps_what_it_has_found(sampler, monkeypatch, caplog):
     assert stored(few) is None
     assert len(said) == 1
     np.testing.assert_array_equal(right["posterior"]["mu"], missed["posterior"]["mu"])
+
+
+def test_a_pause_while_the_time_is_measured_does_not_end_the_check(monkeypatch):
+    """As a collection of garbage is one: the processor is busy, and the evaluations wait."""
+    clock, calls = iter(np.cumsum([0, 9.0, 0, 1e-5, 0, 1e-5])), []
+    monkeypatch.setattr(sentences.time, "process_time", lambda: next(clock))
+    draws, log_density = cut_normals()
+
+    def evaluate(x, rng):
+        calls.append(len(x))
+        return -0.5 * x[:, 0] ** 2
+
+    assert unvisited(
+        model_of(lambda: pm.Normal("a")),
+        draws,
+        log_density,
+        evaluate,
+        1.0,
+        np.random.default_rng(1),
+    )
+    assert sum(calls) > 100
