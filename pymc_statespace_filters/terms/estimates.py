@@ -130,10 +130,11 @@ class Visits:
         """How far sub-models that were not met may move inclusions (K,).
 
         What the other chains have missed of the visits of one is about as much as all have missed
-        of the posterior, or more.
+        of the posterior, or more. Frequencies of visits miss nothing, and bound it.
         """
         moved = self.frequency_alone - self.alone[:, None] * inclusion
-        return np.asarray(np.sqrt((moved**2).mean(axis=0)))
+        bound = np.hypot(self.frequency - inclusion, self.error)
+        return np.asarray(np.minimum(np.sqrt((moved**2).mean(axis=0)), bound))
 
 
 class Sampler:
