@@ -14,6 +14,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning
 from pymc_statespace_filters.evidence.exchangeable_labels import (
     Axis,
+    Share,
     _features,
     _log_visited,
     exchangeable_labels,
@@ -161,6 +162,11 @@ def test_two_of_three_labels_alone_may_not_be_exchanged(one):
         mean = pm.Normal("mu", 0, 5, shape=3)
         pm.Potential("likelihood", mean[0] * mean[3 - one] + mean[one])
     assert not exchangeable_labels(model, idata, np.zeros((2, 50)), rng)
+
+
+def test_a_share_says_of_the_other_label_what_is_left():
+    found = _features({"w": np.array([0.2, 0.9])}, [Share("w")])
+    np.testing.assert_allclose(found, [[[0.2], [0.8]], [[0.9], [0.1]]])
 
 
 def test_a_matrix_says_of_a_label_what_is_on_its_diagonal():

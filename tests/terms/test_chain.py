@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pymc_statespace_filters.terms import chain
+from pymc_statespace_filters.terms.estimates import Visits
 from pymc_statespace_filters.terms.inclusion import InclusionPrior
 from pymc_statespace_filters.terms.probabilities import Probabilities
 
@@ -58,6 +59,25 @@ class Independent:
 
     def lost(self, sets):
         return np.zeros(len(sets), dtype=bool)
+
+
+@pytest.mark.parametrize(
+    ("frequency", "error", "most"),
+    [
+        (0.8, 0.5, np.sqrt((0.06**2 + 0.12**2) / 2)),  # by what each chain has visited alone
+        (0.35, 0.03, np.hypot(0.05, 0.03)),  # by frequencies, which are more certain
+    ],
+)
+def test_how_far_an_inclusion_may_move(frequency, error, most):
+    visits = Visits(
+        sets=np.array([[True]]),
+        points=[],
+        frequency=np.array([frequency]),
+        error=np.array([error]),
+        alone=np.array([0.1, 0.3]),
+        frequency_alone=np.array([[0.1], [0.0]]),
+    )
+    np.testing.assert_allclose(visits.missed(np.array([0.4])), most)
 
 
 def test_what_was_not_met_is_part_of_the_error(monkeypatch):
