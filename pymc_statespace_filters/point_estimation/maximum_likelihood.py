@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-import pymc as pm
 from numpy.typing import NDArray
 from pymc.model import Model
 
 from ..errors import ModelError
 from ..evidence.estimators.newton import BatchFunction
 from ..pymc_model.density import ConstrainedValues
+from ..pymc_model.elements import labels_of
 from ..pymc_model.inspection import given_model
 from ..pymc_model.prior import ModelFactors
 from ..pymc_model.stepped import stepped_variables
@@ -194,7 +194,9 @@ def _described(
     """The maximum in the model's units."""
     values = ConstrainedValues(model)
     estimate = values(peak.point)
-    labels = scalar_labels(model, estimate)
+    labels = [
+        label for name, value in estimate.items() for label in labels_of(name, value.shape, model)
+    ]
     covariance, simulation, reasons = errors_of(values, peak, population, labels)
     ends = np.cumsum([value.size for value in estimate.values()])[:-1]
 
@@ -329,16 +331,3 @@ def _reason_of_steps(ends: list[float]) -> str:
     return (
         f"{reason}; within 1.92 nats of the maximum from {low:.4g} to {high:.4g}, the others held"
     )
-
-
-def scalar_labels(model: pm.Model, values: Mapping[str, np.ndarray]) -> list[str]:
-    """Labels of all scalars in values: a name, and its coordinates or indices in brackets."""
-    return [label for name, value in values.items() for label in _labels(model, name, value.shape)]
-
-
-def _labels(model: pm.Model, name: str, shape: tuple[int, ...]) -> Iterator[str]:
-    dims = model.named_vars_to_dims.get(name, (None,) * len(shape))
-    coords = [model.coords.get(dim) for dim in dims]
-    for index in np.ndindex(*shape):
-        parts = [i if coord is None else coord[i] for i, coord in zip(index, coords, strict=True)]
-        yield f"{name}[{', '.join(map(str, parts))}]" if parts else name

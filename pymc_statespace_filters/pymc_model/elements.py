@@ -11,6 +11,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pymc as pm
 from pytensor.tensor.variable import TensorVariable
 
@@ -46,7 +47,7 @@ class Elements:
         meanings: dict[str, set[Columns]] = defaultdict(set)
         for rv in model.free_RVs:
             shape = start[model.rvs_to_values[rv].name].shape
-            own, positions = _labels(rv.name, shape, model)
+            own, positions = labels_of(rv.name, shape, model), _positions(rv.name, shape)
             columns = range(len(labels), len(labels) + len(own))
             meanings[rv.name].add(tuple(columns))
             for column, *names in zip(columns, own, positions, strict=True):
@@ -91,21 +92,24 @@ def element_names(model: pm.Model, values: Sequence[TensorVariable] | None = Non
     return [
         label
         for value in values or [model.rvs_to_values[rv] for rv in model.free_RVs]
-        for label in _labels(model.values_to_rvs[value].name, point[value.name].shape, model)[0]
+        for label in labels_of(model.values_to_rvs[value].name, point[value.name].shape, model)
     ]
 
 
-def _labels(name: str, shape: tuple[int, ...], model: pm.Model) -> tuple[list[str], list[str]]:
-    """Of the elements of a variable: the labels by coordinates, and those by position."""
+def labels_of(name: str, shape: tuple[int, ...], model: pm.Model) -> list[str]:
+    """The labels of a variable of this shape: ArviZ's, by position where these are not unique."""
     dims = model.named_vars_to_dims.get(name) or (None,) * len(shape)
     coords = [model.coords.get(dim) for dim in dims]
     axes = [
-        range(n) if values is None or len(values) != n else values
+        range(n) if values is None or len(values) != n else np.asarray(pd.Index(values))
         for values, n in zip(coords, shape, strict=True)
     ]
     labels = [_label(name, one) for one in product(*axes)]
-    positions = [_label(name, one) for one in np.ndindex(shape)]
-    return labels if len(set(labels)) == len(labels) else positions, positions
+    return labels if len(set(labels)) == len(labels) else _positions(name, shape)
+
+
+def _positions(name: str, shape: tuple[int, ...]) -> list[str]:
+    return [_label(name, one) for one in np.ndindex(shape)]
 
 
 def _label(name: str, at: tuple[object, ...]) -> str:

@@ -28,8 +28,8 @@ Array = NDArray[np.float64]
 class PriorDraws:
     """A function that draws variables of a model, on the unconstrained space.
 
-    Distributions of NumPy draw many points in one call, with the random numbers of one call for
-    each. Others, as those of a user's function, are called for each point.
+    Distributions of NumPy draw many points in one call. Others, as those of a user's function, are
+    called for each point.
     """
 
     def __init__(self, model: pm.Model, variables: Sequence[TensorVariable]) -> None:

@@ -12,7 +12,7 @@ when the first steps are over begins again there.
 The proposal density of a sub-model is fitted when it is first met, from points of its own, and
 stays. All weights together then give the evidences of all sub-models that were met, and
 probabilities renormalised over these, which have smaller errors than frequencies of visits but know
-nothing of what was not met. How much that is, what one chain visits and no other has met tells.
+nothing of what was not met. What one chain visits and no other has met shows how much that is.
 """
 
 from collections import defaultdict

@@ -1,5 +1,7 @@
 """Elements of variables by their position and by their coordinates."""
 
+import arviz as az
+import pandas as pd
 import pymc as pm
 import pytest
 
@@ -31,6 +33,24 @@ def test_labels_are_those_of_arviz():
     rest = ["sigma", "b[0]", "b[1]", "a[1]", "a[2]", "c[0]", "c[1]", "p[0]", "p[1]"]
     assert list(found.labels) == k + rest
     assert found.variables[3:6] == ("k", "sigma", "b")
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        pd.date_range("2020-01-01", periods=2),
+        [pd.Timestamp("2020-01-01 06:30"), pd.Timestamp("2021-01-01")],
+        pd.to_timedelta([1, 2], unit="h"),
+        [True, False],
+        [0.5, 1e-20],
+        ["a", "b"],
+    ],
+)
+def test_coordinates_are_written_as_in_a_summary(values):
+    with pm.Model(coords={"at": values}) as model:
+        pm.Normal("a", dims="at")
+        idata = pm.sample_prior_predictive(20, random_seed=1)
+    assert element_names(model) == list(az.summary(idata, group="prior", kind="stats").index)
 
 
 def test_messages_name_elements_of_some_variables_so():
