@@ -298,7 +298,9 @@ RECORDS = {
     "data too wide": (dict(observed=np.zeros((2, 2))), r"observed .*\(2, 1\).*\(2, 2\)"),
     "data infinite": (dict(observed=[0.0, np.inf]), r"observed .*NaN where missing.*inf"),
     "data words": (dict(observed=["a", "b"]), "observed must be numbers"),
-    "data complex": (dict(observed=[1.0, 1j]), "observed must be numbers, got .*1j"),
+    "data complex": (
+        dict(observed=np.array([1.0, 1j])), "observed must be numbers, got .*1.j"
+    ),  # of which numpy would leave out the imaginary parts
     "dates in a column": (
         dict(steps=None,
              observed=pd.DataFrame({"day": pd.date_range("2020", periods=2), "z": [0.0, 1.0]})),
