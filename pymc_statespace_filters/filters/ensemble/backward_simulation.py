@@ -42,8 +42,8 @@ def _store(integers, reals, event, j, k, X, log_w, d, D, ancestors):
     if event == FORECAST or event == UPDATED:
         size = (n + 1) * N
         at = carray(reals, ((k + 1) * size,))[k * size :]
-        at[: n * N] = carray(X, (n * N,))
-        at[n * N :] = carray(log_w, (N,))
+        copy_into(at[: n * N], carray(X, (n * N,)))
+        copy_into(at[n * N :], carray(log_w, (N,)))
 
 
 STORE = EntryPoint(_store, CALLBACK_ARGUMENTS, "store_particles")

@@ -11,7 +11,7 @@ Those of probabilities are finite where a probability is zero.
 import numpy as np
 
 from ...compiler.native.entry_point import call_address
-from ...compiler.native.jit import njit_internal
+from ...compiler.native.jit import copy_into, njit_internal
 from ...compiler.native.plan import HEALTH_SIZE, RECORD, REQUEST, RESULTS, plan_entry
 from ..calls import OK, end_of_record, opened, reals_at, single_record
 from ..outcomes import NONE, is_missing
@@ -153,10 +153,12 @@ def _backward(plan, record, request, results):
         chain, bar = read_chain(call.plan, data.theta, data.inputs), np.zeros(n_theta)
         place = backward_pass(chain, data, tape, place, terms_bar[begin:], bar)
         if call.plan[PLAN.extend_back] == 0:
-            theta_bar[number, :] = bar
+            copy_into(theta_bar[number], bar)
         elif bar.any():
-            both = np.concatenate((data.theta, bar))
-            size = np.int64(both.size)
+            size = np.int64(data.theta.size + bar.size)
+            both = np.empty(size)
+            copy_into(both, data.theta)
+            copy_into(both[data.theta.size :], bar)
             call_address(call.plan[PLAN.extend_back], (both, size, theta_bar[number]))
     return OK
 

@@ -63,7 +63,7 @@ def predicted_at_observations(chain, record, tape, known):
     for j in range(known):
         place += record.steps[j] - k
         k = record.steps[j]
-        found[j, :] = tape[place]
+        copy_into(found[j], tape[place])
         place += 0 if is_missing(record.observed, j) else 2
     return found
 
@@ -133,7 +133,9 @@ def _read_backwards(chain, record, tape, n_taped, rows, seed, probabilities, pat
 def _read_path(chain, record, tape, rows, probabilities, paths):
     """Write the most probable path, whose states have probability one."""
     path = most_probable_path(chain, record, tape)
-    for r in range(min(rows.size, np.searchsorted(rows, path.size))):
+    for r in range(rows.size):
+        if rows[r] >= path.size:
+            break
         paths[r] = path[rows[r]]
         probabilities[r, :] = 0.0
         probabilities[r, paths[r]] = 1.0

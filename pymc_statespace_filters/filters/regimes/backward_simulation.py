@@ -230,7 +230,17 @@ def _draw_before(moves, a, X, n_finite, seed, k, first, path):
 
 
 @njit_internal
-def _write_row(out, n_rows, row, order, means, variances, drawn, parts):
+def _n_distinct(indices, n):
+    """How many of the indices below n occur; numba's sort takes a second of compilation."""
+    is_met, found = np.zeros(n, np.bool_), 0
+    for i in indices:
+        found += not is_met[i]
+        is_met[i] = True
+    return found
+
+
+@njit_internal
+def _write_row(out, n_rows, row, order, means, variances, drawn, n_parts):
     """Write mean, deviation and the first path; and how many parts all of them come from."""
     M, n = means.shape
     moments = out[: 3 * n * n_rows].reshape(3, n_rows, n)
@@ -242,7 +252,7 @@ def _write_row(out, n_rows, row, order, means, variances, drawn, parts):
             between += (means[path, column] - mean) ** 2 / (M - 1)
         moments[0, row, a], moments[1, row, a] = mean, math.sqrt(total + between)
         moments[2, row, a] = drawn[column]
-    out[3 * n * n_rows + row] = np.unique(parts).size
+    out[3 * n * n_rows + row] = n_parts
 
 
 @njit_internal
@@ -270,5 +280,6 @@ def simulate_backward(mixtures, n_paths, seed, rows, out):
             parts[m] = moves.part[chosen]
             _draw_before(moves, chosen, X, n_finite, seed, k, 1 + 2 * n * m, paths[m])
         if is_wanted:
-            _write_row(out, rows.size, row, mixtures.order, means, variances, paths[0], parts)
+            n_parts = _n_distinct(parts, N)
+            _write_row(out, rows.size, row, mixtures.order, means, variances, paths[0], n_parts)
             row -= 1

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compiler.native.jit import njit_internal
+from ...compiler.native.jit import copy_into, njit_internal
 from ...compiler.native.plan import REQUEST, RESULTS, Plan, plan_entry
 from ..calls import ALL_STEPS, OK, opened, wanted_rows
 from ..ensemble.summaries import write_summaries
@@ -140,8 +140,9 @@ def _stored(tape, table, given, n):
     stored = np.empty((steps.size, X.shape[0] + 1, X.shape[1]))
     for k in range(steps.size):
         w, X = _parts(tape[places[k]], n, given.n_finite, given.regimes)
-        stored[k, :-1] = X
-        stored[k, -1] = np.log(w)
+        for i in range(X.shape[0]):
+            copy_into(stored[k, i], X[i])
+        copy_into(stored[k, -1], np.log(w))
     return stored
 
 
