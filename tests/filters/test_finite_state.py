@@ -24,6 +24,8 @@ from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.parameters import flat_parameters
 from pymc_statespace_filters.system.record import checked_record
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 # A regime that remembers the one before, is pushed by an input, and is seen by two sensors.
 SWITCH = psf.StateSpaceModel(
     transition=lambda x, q: [q[0], x[0]],
@@ -77,18 +79,16 @@ WORN = {"p": [0.2], "rate": 1.5}
 COUNTS = {"observed": np.array([0.0, np.nan, 1.0, 2.0, 0.0, 5.0]), "steps": [0, 1, 2, 4, 5, 8]}
 
 
-def wear_log_likelihood(p, rate, observed, steps):
-    """By all paths."""
-    total = 0.0
-    for path in itertools.product(range(3), repeat=steps[-1] + 1):
-        probability = float(path[0] == 0)
-        for i, j in itertools.pairwise(path):
-            up = p[0] * (1 + i) if i < 2 else 0.0
-            probability *= {0: 1 - up, 1: up}.get(j - i, 0.0)
-        for k, d in zip(steps, observed, strict=True):
-            probability *= 1.0 if np.isnan(d) else poisson.pmf(d, 0.1 + rate * path[k])
-        total += probability
-    return np.log(total)
+def wear_paths(p, rate, observed, steps):
+    """All paths of the stage, and the probability of each and the data."""
+    paths = np.array(list(itertools.product(range(3), repeat=steps[-1] + 1)))
+    ups = np.array([p[0], 2 * p[0], 0.0])
+    moves = np.diag(1 - ups) + np.diag(ups[:2], 1)
+    probability = (paths[:, 0] == 0) * moves[paths[:, :-1], paths[:, 1:]].prod(axis=1)
+    for k, d in zip(steps, observed, strict=True):
+        if not np.isnan(d):
+            probability *= poisson.pmf(d, 0.1 + rate * np.arange(3))[paths[:, k]]
+    return paths, probability
 
 
 def arguments_of(system, params, record):
@@ -134,7 +134,8 @@ def test_all_paths_of_a_regime_with_memory():
 def test_all_paths_through_impossible_moves():
     """And a count that is missing."""
     terms = psf.log_likelihood(WEAR, psf.FiniteStateFilter(), WORN, **COUNTS)
-    np.testing.assert_allclose(terms.sum(), wear_log_likelihood(**WORN, **COUNTS), rtol=1e-12)
+    _, probability = wear_paths(**WORN, **COUNTS)
+    np.testing.assert_allclose(terms.sum(), np.log(probability.sum()), rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -354,15 +355,9 @@ def test_the_most_probable_path_where_moves_are_impossible():
         run = psf.run_filter(
             WEAR, psf.FiniteStateFilter(), WORN, observed, steps=steps, panel=panel, at="steps"
         )
-    probabilities = {}
-    for path in itertools.product(range(3), repeat=9):
-        ups = [WORN["p"][0] * (1 + i) if i < 2 else 0.0 for i in range(3)]
-        stays = [{0: 1 - ups[i], 1: ups[i]}.get(j - i, 0.0) for i, j in itertools.pairwise(path)]
-        seen = zip(COUNTS["steps"], COUNTS["observed"], strict=True)
-        density = [poisson.pmf(d, 0.1 + 1.5 * path[k]) for k, d in seen if not np.isnan(d)]
-        probabilities[path] = (path[0] == 0) * np.prod(stays) * np.prod(density)
+    paths, probability = wear_paths(**WORN, **COUNTS)
     found = run["most_probable_path"].values[:, 0]
-    assert tuple(found[:9]) == max(probabilities, key=probabilities.get)
+    np.testing.assert_array_equal(found[:9], paths[probability.argmax()])
     assert np.isnan(found[9:]).all()
 
 

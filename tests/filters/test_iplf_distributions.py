@@ -19,6 +19,8 @@ from tests.distributions import TABLE
 from tests.modes import AS_IT_STANDS
 from tests.systems import counts
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 
 def observed_by(*distributions):
     """One state, which is observed by distributions of it."""
@@ -119,34 +121,48 @@ def decays(rate):
     return {"a": 1.0 - 0.1 * rate, "noise_var": 0.1 * 0.7**2}
 
 
-@pytest.fixture(scope="module")
-def sixty_counts():
-    """Sixty counts of mean 3, and mean and sd of the exact posterior of their rate and level."""
-    truth = decays(0.5) | {"level": 1.0}
-    record = psf.simulate(counts(), truth, steps=STEPS, random_seed=1)["observations"].values
-    params = decays(RATE) | {"level": LEVEL}
-    terms = psf.log_likelihood(counts(), psf.GridFilter(), params, record, steps=STEPS)
+ON_GRID = decays(RATE) | {"level": LEVEL}
+
+
+def moments_on_grid(terms):
+    """Mean and sd of the posterior of rate and level, by their terms on the grid."""
     density = terms.sum(axis=-1) - 0.5 * RATE**2 - 0.5 * (LEVEL / 2.0) ** 2
     weights = np.exp(density - density.max())
     weights /= weights.sum()
     mean = np.array([(weights * v).sum() for v in (RATE, LEVEL)])
     square = np.array([(weights * v**2).sum() for v in (RATE, LEVEL)])
-    return record, mean, np.sqrt(square - mean**2)
+    return mean, np.sqrt(square - mean**2)
 
 
-def test_nuts_samples_the_posterior_of_counts(sixty_counts):
-    """Means within a tenth of a posterior sd; the sampling error of 1600 draws is a third of it."""
+@pytest.fixture(scope="module")
+def sixty_counts():
+    """Sixty counts of mean 3, and mean and sd of the exact posterior of their rate and level."""
+    truth = decays(0.5) | {"level": 1.0}
+    record = psf.simulate(counts(), truth, steps=STEPS, random_seed=1)["observations"].values
+    terms = psf.log_likelihood(counts(), psf.GridFilter(), ON_GRID, record, steps=STEPS)
+    return record, *moments_on_grid(terms)
+
+
+def test_the_posterior_of_counts_is_nearly_exact_and_nuts_samples_it(sixty_counts):
+    """By IPLF means are within a tenth of a posterior sd, and deviations within a tenth.
+
+    Those of NUTS have four standard errors more; a hundred draws have ranks as good as thirty.
+    """
     record, mean, sd = sixty_counts
+    terms = psf.log_likelihood(counts(), psf.IPLF(), ON_GRID, record, steps=STEPS)
+    by_iplf = moments_on_grid(terms)
+    assert (np.abs(by_iplf[0] - mean) < 0.1 * sd).all(), (by_iplf[0], mean, sd)
+    np.testing.assert_allclose(by_iplf[1], sd, rtol=0.1)
     with pm.Model():
         params = decays(pm.HalfNormal("rate", 1.0)) | {"level": pm.Normal("level", 0.0, 2.0)}
         psf.StateSpace("d", counts(), psf.IPLF(), params=params, steps=STEPS, observed=record)
         idata = pm.sample(
-            800, tune=500, chains=2, cores=1, random_seed=4, progressbar=False,
+            100, tune=100, chains=1, nuts_sampler="pymc", random_seed=4, progressbar=False,
             compute_convergence_checks=False,
         )  # fmt: skip
     draws = np.array([idata.posterior[name].values.ravel() for name in ("rate", "level")])
-    assert (np.abs(draws.mean(axis=1) - mean) < 0.1 * sd).all(), (draws.mean(axis=1), mean, sd)
-    np.testing.assert_allclose(draws.std(axis=1), sd, rtol=0.15)
+    assert (np.abs(draws.mean(axis=1) - by_iplf[0]) < 4 * by_iplf[1] / 30**0.5).all()
+    assert (draws.std(axis=1) > 0.4 * by_iplf[1]).all()
 
 
 @pytest.mark.parametrize("filter", [psf.EKF(), psf.UKF()])
