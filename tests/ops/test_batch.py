@@ -94,6 +94,7 @@ def test_points_that_all_fail():
     np.testing.assert_array_equal(health, health_alone)
 
 
+@pytest.mark.usefixtures("interpreted")
 def test_vectorizing_a_graph_over_parameters_makes_one_batch():
     theta, thetas = pt.dvector("theta"), pt.dtensor3("thetas")
     terms, health = LogLikelihood(PAIR, psf.EKF())(theta, *RECORD)
@@ -121,6 +122,7 @@ def test_other_batches_are_loops(filter):
     assert not [n for n in nodes if getattr(n.op, "form", None) == signatures.POINTS]
 
 
+@pytest.mark.usefixtures("interpreted")
 def test_gradient_of_a_batch():
     thetas = pt.dmatrix("thetas")
     terms, _ = LogLikelihood(PAIR, psf.EKF(), signatures.POINTS)(thetas, *RECORD)
@@ -139,6 +141,7 @@ def test_arrays_of_parameters_without_pymc():
         np.testing.assert_allclose(got[index], alone, rtol=1e-12)
 
 
+@pytest.mark.usefixtures("interpreted")
 def test_log_density_of_a_batch_of_parameters_in_pymc():
     thetas = pt.dmatrix("thetas")
     record = (STEPS, np.zeros((0, 0)), 0.0, 0)

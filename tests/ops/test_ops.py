@@ -187,14 +187,13 @@ def test_shapes_are_known_without_evaluating():
     assert [int(n) for n in function(THETA)] == [4, 3, 2]
 
 
-@pytest.mark.parametrize("filter", [psf.EKF(), PF], ids=lambda f: type(f).__name__)
-def test_batch_equals_loop(filter):
+def test_batch_equals_loop():
     theta, seed = pt.dmatrix("theta"), pt.lvector("seed")
     fixed = inputs()[1:-1]
-    terms, _ = Blockwise(LogLikelihood(PAIR, filter))(theta, *fixed, seed)
+    terms, _ = Blockwise(LogLikelihood(PAIR, PF))(theta, *fixed, seed)
     thetas, seeds = np.array([[0.6, 0.2], [0.1, 0.2], [0.9, -0.3]]), np.array([1, 2, 2])
     batch = pytensor.function([theta, seed], terms)(thetas, seeds)
-    evaluate = evaluator(LogLikelihood(PAIR, filter))
+    evaluate = evaluator(LogLikelihood(PAIR, PF))
     loop = [evaluate(*inputs(t, seed=s))[0] for t, s in zip(thetas, seeds, strict=True)]
     np.testing.assert_array_equal(batch, loop)
 

@@ -5,7 +5,7 @@ import numpy as np
 import pymc as pm
 import pytest
 from scipy.special import logsumexp
-from scipy.stats import norm
+from scipy.stats import halfnorm, norm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import GradientUnavailableError
@@ -66,31 +66,48 @@ def log_density():
     return norm(PRIOR_MEAN, PRIOR_SD).logpdf(GRID) + [forced_terms(a).sum() for a in GRID]
 
 
-@pytest.fixture(scope="module")
-def distribution_function(log_density):
-    """P(a < x | d), by quadrature."""
+def ranks(draws, grid, log_density):
+    """P(a < draw | d), by quadrature."""
     mass = np.cumsum(np.exp(log_density - log_density.max()))
-    return lambda x: np.interp(x, GRID, mass / mass[-1])
+    return np.interp(draws, grid, mass / mass[-1])
 
 
-@pytest.mark.parametrize("sample", SAMPLERS.values(), ids=SAMPLERS)
-def test_each_sampler_has_the_exact_posterior(sample, distribution_function, log_density):
+def check_posterior(idata, model, grid, log_density):
     """The ranks of the draws are uniform: mean and variance within 4.5 standard errors.
 
     One of the ten comparisons of correct samplers fails in one of 15 000 sets of seeds. The
     evidence by the same draws is that of the quadrature.
     """
-    with forced_model() as model:
-        idata = sample(500)
     evidence = psf.chib_jeliazkov(idata, model, random_seed=1, progressbar=False)
-    exact = logsumexp(log_density) + np.log(GRID[1] - GRID[0])
+    exact = logsumexp(log_density) + np.log(grid[1] - grid[0])
     assert abs(evidence.log_evidence - exact) < 4.5 * evidence.se < 0.3
-    draws = idata["posterior"]["a"].to_numpy()
-    centred = distribution_function(draws) - 0.5
+    (name,) = idata["posterior"].data_vars
+    centred = ranks(idata["posterior"][name].to_numpy(), grid, log_density) - 0.5
     for values, mean, variance in ((centred, 0.0, 1 / 12), (centred**2, 1 / 12, 1 / 180)):
         effective = float(az.ess(values))
-        assert effective > 200
+        assert effective > 120
         assert abs(values.mean() - mean) < 4.5 * np.sqrt(variance / effective)
+
+
+@pytest.mark.parametrize("name", ["numpyro", "nutpie, gradient by PyTensor"])
+def test_each_sampler_has_the_exact_posterior(name, log_density):
+    """Those that the page on JAX does not call."""
+    with forced_model() as model:
+        idata = SAMPLERS[name](500)
+    check_posterior(idata, model, GRID, log_density)
+
+
+def test_the_samplers_of_the_page_on_jax_have_the_exact_posterior():
+    """Of a linear system, whose likelihood the Kalman filter has: a rate and its prior."""
+    names = run_code_of("docs/howto/jax.md")
+    rates = np.linspace(1e-3, 3.0, 1001)
+    terms = psf.log_likelihood(
+        names["relaxation"], psf.EKF(), {"rate": rates}, names["record"]["observations"],
+        steps=names["steps"],
+    )  # fmt: skip
+    log_density = halfnorm.logpdf(rates) + terms.sum(axis=1)
+    for sampler in ("numpyro", "blackjax", "nutpie"):
+        check_posterior(names[f"by_{sampler}"], names["model"], rates, log_density)
 
 
 @pytest.mark.parametrize("name", SAMPLERS)
@@ -113,37 +130,28 @@ def test_chains_of_a_long_record_run_at_once():
     assert abs(idata["posterior"]["a"] - 0.7).max() < 0.1  # a standard deviation is 0.013
 
 
-def assert_fits(draws, distribution_function):
+def assert_fits(draws, log_density):
     """The posterior is nearly normal, and its approximation nearly the posterior."""
-    ranks = distribution_function(np.ravel(draws))
-    assert abs(ranks.mean() - 0.5) < 0.1
-    assert abs(ranks.var() - 1 / 12) < 0.03
+    found = ranks(np.ravel(draws), GRID, log_density)
+    assert abs(found.mean() - 0.5) < 0.1
+    assert abs(found.var() - 1 / 12) < 0.03
 
 
 # PyTensor warns at each function of JAX that draws; users see it once.
 @pytest.mark.filterwarnings("ignore:The RandomType SharedVariables:UserWarning")
-def test_variational_inference(distribution_function):
+def test_variational_inference(log_density):
     with forced_model():
         fit = pm.fit(
             2000, obj_optimizer=pm.adam(learning_rate=0.02), random_seed=1, progressbar=False,
             compile_kwargs={"mode": "JAX"},
         )  # fmt: skip
-    assert_fits(fit.sample(1000, random_seed=1)["posterior"]["a"], distribution_function)
+    assert_fits(fit.sample(1000, random_seed=1)["posterior"]["a"], log_density)
 
 
-def test_pathfinder(distribution_function):
+def test_pathfinder(log_density):
     logp = pymc_jax.get_jaxified_logp(forced_model())
     key = jax.random.key(1)
-    state, _ = blackjax.vi.pathfinder.approximate(key, logp, [jax.numpy.array(0.5)])
+    start = [jax.numpy.array(0.5)]
+    state = jax.jit(lambda key: blackjax.vi.pathfinder.approximate(key, logp, start)[0])(key)
     draws, _ = blackjax.vi.pathfinder.sample(key, state, 1000)
-    assert_fits(draws[0], distribution_function)
-
-
-def test_the_page_on_jax_runs():
-    names = run_code_of("docs/howto/jax.md")
-    means = [
-        float(names[f"by_{sampler}"]["posterior"]["rate"].mean())
-        for sampler in ("numpyro", "blackjax", "nutpie")
-    ]
-    posterior_sd = float(names["by_numpyro"]["posterior"]["rate"].std())
-    assert np.ptp(means) < 0.5 * posterior_sd
+    assert_fits(draws[0], log_density)

@@ -1,4 +1,4 @@
-"""Log-densities written out as scalar code: the numbers and the errors of numba's machine code."""
+"""Log-densities written out as scalar code: the numbers and the errors of the graph."""
 
 import numpy as np
 import pymc as pm
@@ -27,19 +27,20 @@ def call(bound):
     return make_call(bound)
 
 
-def compiled(model):
+def compiled(model, **options):
     """PyTensor's function of a model's log-density, its prior and its filters' health."""
     shared = noise_seeds(model)
     outputs = [model.logp(), model.logp(vars=model.free_RVs), *health_outputs([model.logp()])]
     values = [model.rvs_to_values[rv] for rv in model.free_RVs]
-    function, start = compile_raveled(model.initial_point(), outputs, values, shared)
+    function, start = compile_raveled(model.initial_point(), outputs, values, shared, **options)
     return function, [start, *(np.array(seed.get_value()) for seed in shared.values())]
 
 
 def assert_written_out(model):
-    """The model's function is scalar code, with the numbers of numba's code at many points."""
+    """The model's function is scalar code, with the numbers of the graph at many points."""
     function, example = compiled(model)
-    written, truth = native_function(function, example), NativeFunction(function, example)
+    written = native_function(function, example)
+    truth = NativeFunction(compiled(model, mode=AS_IT_STANDS)[0], example)
     assert isinstance(written, WrittenFunction)
     assert written.kinds == truth.kinds
     rng = np.random.default_rng(1)

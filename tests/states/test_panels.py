@@ -13,6 +13,8 @@ from pymc_statespace_filters.system.panel_records import records_of
 from tests.states.models import EKF, posterior
 from tests.systems import FORCED
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 LABELS = np.array(["b", "b", "b", "a", "c", "c"])
 STEPS = np.array([0, 2, 5, 3, 1, 4])
 DATA = np.array([[0.1], [np.nan], [0.8], [-0.4], [0.9], [0.2]])

@@ -33,6 +33,8 @@ from tests.states.models import (
 )
 from tests.systems import FORCED_DATA, PAIR, PAIR_DATA, STEPS
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 PF = psf.BootstrapPF(64)
 ESTIMATES = {"filtered": psf.filtered_states, "smoothed": psf.smoothed_states}
 
