@@ -119,7 +119,7 @@ def test_initial_state_is_drawn_from_its_covariance():
         initial_mean=[1.0, 2.0],
         initial_cov=cov,
     )
-    rng, n = np.random.default_rng(2), 4000
+    rng, n = np.random.default_rng(2), 800
     x = np.array([
         psf.simulate(system, {}, steps=[0], random_seed=rng).states.values[0] for _ in range(n)
     ])  # fmt: skip

@@ -138,7 +138,12 @@ def test_it_is_sampled_and_gives_evidence_and_states(cubature):
     # Without numba PyTensor calls the machine code of the likelihood, which is there already.
     with pytensor.config.change_flags(mode="FAST_COMPILE"), model_of(cubature):
         idata = psf.sample_dram(
-            1000, tune=500, chains=2, random_seed=3, compute_convergence_checks=False
+            400,
+            tune=200,
+            chains=2,
+            random_seed=3,
+            progressbar=False,
+            compute_convergence_checks=False,
         )
         evidence = psf.chib_jeliazkov(idata, random_seed=1)
         states = psf.filtered_states(idata, n_draws=4, random_seed=2)["filtered_states"]

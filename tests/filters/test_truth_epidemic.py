@@ -74,7 +74,7 @@ def compared(epidemic, n_weeks, n_paths, dt):
 @pytest.mark.parametrize(
     ("population", "n_weeks", "n_paths"),
     [
-        (1e3, 12, 1000),
+        (1e3, 12, 500),
         pytest.param(1e4, 400, 200, marks=pytest.mark.slow),
         pytest.param(1e5, 400, 150, marks=pytest.mark.slow),
         pytest.param(1e7, 100, 40, marks=pytest.mark.slow),
