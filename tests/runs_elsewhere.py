@@ -22,14 +22,15 @@ def test_nothing_of_linux_is_left(tmp_path):
         os.unlink(tmp_path / "file")
 
 
+@pytest.mark.usefixtures("interpreted")
 def test_a_run_and_its_checkpoint(tmp_path):
     with pm.Model():
         pm.Uniform("a", 0.0, 1.0)
         record = {"steps": range(1, 21), "observed": np.sin(np.arange(20.0))}
         psf.StateSpace("d", FREE, psf.EKF(), **record)
         run = {
-            "draws": 200, "tune": 200, "chains": 2, "random_seed": 1, "progressbar": False,
-            "compute_convergence_checks": False,
+            "draws": 100, "tune": 100, "chains": 2, "initvals": {"a": 0.5}, "random_seed": 1,
+            "progressbar": False, "compute_convergence_checks": False,
         }  # fmt: skip
         whole = psf.sample_dram(**run)["posterior"]["a"].values
         stored = psf.sample_dram(**run, checkpoint=tmp_path)["posterior"]["a"].values

@@ -12,13 +12,18 @@ from pathlib import Path
 import numpy as np
 import pytensor.tensor as pt
 import pytest
+from numba import njit
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.numerics.normals import fill_normals
 from pymc_statespace_filters.compiler.numerics.philox import PROCESS
+from pymc_statespace_filters.filters.kernel_density.simd_windows import (
+    POINTS,
+    add_to_line,
+    sum_line,
+)
 from tests.elsewhere import PLAIN
-from tests.filters.test_kernel_density import log_density
 from tests.waiting import LIMIT
 
 ROOT = Path(__file__).parents[1]
@@ -37,7 +42,8 @@ on_linux = pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="noth
 def test_without_what_linux_has():
     command = [sys.executable, "-m", "pytest", "-q", "-p", "tests.elsewhere", "-p", "no:xdist"]
     # Slow and pure Python; and one whose child process has all of Linux.
-    left_out = "-k", "not every_altered_byte and not truncated_segment and not a_living_process"
+    named = "every_altered_byte", "truncated_segment", "segments_stay_few", "a_living_process"
+    left_out = "-k", " and ".join(f"not {name}" for name in named)
     done = subprocess.run(
         [*command, "-p", "no:cacheprovider", *left_out, *WITHOUT_LINUX],
         cwd=ROOT,
@@ -50,10 +56,17 @@ def test_without_what_linux_has():
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+@njit
+def window_sum(grid, at, lead, ratio):
+    add_to_line(grid, at, 0, lead, ratio, 1.5, 0.0)
+    return sum_line(grid, at + 4, 0, lead, ratio, 0.7, 0.0)
+
+
 def numbers():
     """What is written in vectors, or in instructions that not every processor has.
 
-    A scalar recursion; members moved by normals; and their kernel density in vectors of four.
+    A scalar recursion; members moved by normals; and windows of a kernel density, which are written
+    in LLVM vectors of four.
     """
     system = psf.StateSpaceModel(
         transition=lambda x, q, a: [a * pt.sin(x[0]) + pt.tanh(x[0] - 1.0) + q[0]],
@@ -70,8 +83,9 @@ def numbers():
     machine.propagate.function(
         machine.prepare.function(np.array([1.3])), np.zeros((1, 0)), 0, 0.0, Z, X
     )
-    density = log_density(X, np.full(64, 1 / 64), X + 0.1)
-    return np.concatenate([terms, Z[0], X[0], density])
+    grid = np.linspace(0.0, 1.0, 2 * POINTS)
+    total = window_sum(grid, 7, 1e-3, 0.9)
+    return np.concatenate([terms, Z[0], X[0], grid, [total]])
 
 
 def test_machine_code_of_another_processor():

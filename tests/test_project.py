@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -46,10 +47,16 @@ def test_lock_holds_every_dependency_within_its_bounds():
         assert version in requirement.specifier, f"{requirement}, locked at {version}"
 
 
+@cache
+def nodes_of(file):
+    """Every node of the syntax tree of a file."""
+    return list(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))
+
+
 def imports_from_elsewhere():
     """Every module that the package imports from elsewhere, and the file that does."""
     for file in (ROOT / "pymc_statespace_filters").rglob("*.py"):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        for node in nodes_of(file):
             if isinstance(node, ast.Import):
                 modules = [alias.name for alias in node.names]
             elif isinstance(node, ast.ImportFrom) and not node.level:
@@ -103,11 +110,14 @@ def test_the_insides_of_numba_and_pytensor_are_met_in_the_compiler_alone():
 
 def opened_without_encoding(file):
     """The lines of a file that read or write text in the encoding of the system."""
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    for node in nodes_of(file):
         if isinstance(node, ast.Call):
-            call, name = ast.unparse(node), ast.unparse(node.func)
+            name = ast.unparse(node.func)
             is_open = name.endswith("open") and name not in {"os.open", "tarfile.open"}
             is_text = name.endswith(("read_text", "write_text"))
+            if not is_open and not is_text:
+                continue
+            call = ast.unparse(node)
             if is_open and not re.search("'[rwax]b'", call):
                 is_text = True
             if is_text and "encoding=" not in call:
@@ -213,16 +223,16 @@ def test_a_worker_that_dies_ends_the_run(tmp_path):
     assert "worker restarting disabled" in done.stdout
 
 
-@pytest.mark.parametrize("most", [1, 2])
-def test_a_run_that_compiles_more_than_is_known_fails(tmp_path, most):
+def test_a_run_that_compiles_more_than_is_known_fails(tmp_path):
+    """That it passes otherwise, every run of all tests shows."""
     for name in ("one", "other"):
         lines = "from numba import njit", f"def test_{name}():", "    njit(lambda x: x + 1)(1)"
         (tmp_path / f"test_{name}.py").write_text("\n".join(lines), encoding="utf-8")
-    known = f"import tests.costs\ntests.costs.MOST = {most}"
+    known = "import tests.costs\ntests.costs.MOST = 1"
     (tmp_path / "conftest.py").write_text(known, encoding="utf-8")
     done = run_as_make_does(tmp_path)
-    assert done.returncode == (most < 2), done.stdout
-    assert ("2 functions were compiled" in done.stdout) == (most < 2), done.stdout
+    assert done.returncode == 1, done.stdout
+    assert "2 functions were compiled" in done.stdout, done.stdout
 
 
 @pytest.mark.skipif(

@@ -14,19 +14,23 @@ SCRIPT = """
 import os, sys
 import numpy as np
 import pymc as pm
+import pytensor
 import pymc_statespace_filters as psf
+from tests.modes import AS_IT_STANDS
 from tests.systems import FREE
 
+pytensor.config.mode = AS_IT_STANDS
 record = {"steps": range(1, 21), "observed": np.sin(np.arange(20.0))}
 with pm.Model():
     pm.Uniform("a", 0.0, 1.0)
     psf.StateSpace("d", FREE, psf.EKF(), **record)
-    run = dict(chains=2, random_seed=1, progressbar=False, compute_convergence_checks=False)
+    run = dict(chains=2, initvals={"a": 0.5}, random_seed=1)
+    run |= dict(progressbar=False, compute_convergence_checks=False)
     for comm in (None, "world"):  # without a launcher the world is this process
-        idata = psf.sample_dram(50, tune=50, comm=comm, **run)
+        idata = psf.sample_dram(5, tune=5, comm=comm, **run)
     print(dict(idata["posterior"].sizes), "mpi4py" in sys.modules)
     os.environ["PMIX_RANK"] = "0"  # as if mpiexec had started it
-    psf.sample_dram(50, tune=50, comm="world", **run)
+    psf.sample_dram(5, tune=5, comm="world", **run)
 """
 NO_LIBRARY = {"MPI4PY_LIBMPI": "/nowhere/libmpi.so", "MPI4PY_MPIABI": "none"}
 STUB = "raise RuntimeError('cannot load MPI library')"
@@ -48,7 +52,7 @@ def test_only_comm_needs_mpi(tmp_path, broken):
         encoding="utf-8",
         check=False,
     )
-    assert done.stdout == "{'chain': 2, 'draw': 50} False\n", done.stderr
+    assert done.stdout == "{'chain': 2, 'draw': 5} False\n", done.stderr
     assert done.returncode == 1
     # Nothing before the traceback, whose last line has the error and its cure.
     assert done.stderr.startswith("Traceback (most recent call last):")
