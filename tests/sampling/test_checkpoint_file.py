@@ -18,6 +18,7 @@ from pymc_statespace_filters.errors import (
 from pymc_statespace_filters.sampling.checkpoint import journal
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import open_checkpoint
 from pymc_statespace_filters.sampling.checkpoint.journal import ChainJournal
+from tests.sampling.alone import WITHOUT_PYMC
 from tests.waiting import LIMIT
 
 # Windows has no words of its own for these.
@@ -148,12 +149,12 @@ def test_segments_stay_few_and_draws_are_not_written_often(tmp_path, monkeypatch
 
     monkeypatch.setattr(journal.os, "replace", counted)
     stored = journal_in(tmp_path)
-    for i in range(300):
+    for i in range(100):
         append_all(stored, [100], first=100 * i)
-        assert len(list(tmp_path.iterdir())) <= 3 * 5 + 1  # 4^5 > 300
+        assert len(list(tmp_path.iterdir())) <= 3 * 4 + 1  # 4^4 > 100
     of_one = n_bytes[0]
-    assert sum(n_bytes) < 300 * of_one * 5.1
-    assert_holds(journal_in(tmp_path).read(), 30_000)
+    assert sum(n_bytes) < 100 * of_one * 4.1
+    assert_holds(journal_in(tmp_path).read(), 10_000)
 
 
 def test_draws_that_are_many_are_not_merged(tmp_path, monkeypatch):
@@ -193,7 +194,8 @@ def test_a_segment_that_is_damaged_before_it_is_merged_is_an_error(tmp_path, mon
 def test_a_truncated_segment_is_as_if_it_were_not_there(tmp_path, number):
     paths = write_journal(tmp_path, [2, 1, 1])
     whole = [path.read_bytes() for path in paths]
-    for size in range(len(whole[number])):
+    # Anywhere in the middle one; the same code reads the others.
+    for size in range(0, len(whole[number]), 1 if number == 1 else 9):
         for path, content in zip(paths, whole, strict=True):
             path.write_bytes(content)
         paths[number].write_bytes(whole[number][:size])
@@ -426,21 +428,13 @@ def in_another_process(script, *arguments):
 
 # A run that is killed before or after a call that touches the disk, each in turn; then taken up
 # again, and killed again a few calls later, until it is done.
-KILLED_RUNS = """
-import os, sys, types, warnings
-from importlib.util import find_spec
+KILLED_RUNS = f"""
+import os, sys, warnings
 from pathlib import Path
 import numpy as np
-
-# Without PyMC, which takes seconds to import and to fork.
-sources = Path(find_spec("pymc_statespace_filters").origin).parents[1]
-for name in (
-    "pymc_statespace_filters",
-    "pymc_statespace_filters.sampling",
-    "pymc_statespace_filters.sampling.checkpoint",
-):
-    sys.modules[name] = types.ModuleType(name)
-    sys.modules[name].__path__ = [str(sources / name.replace(".", "/"))]
+{WITHOUT_PYMC}
+"""
+KILLED_RUNS += """
 from pymc_statespace_filters.sampling.checkpoint import checkpoint, journal, lease
 
 journal._FAN_IN = int(sys.argv[2])
@@ -533,9 +527,9 @@ print(n_calls)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork, no kill -9")
-@pytest.mark.parametrize("fan_in", [16, 2], ids=["growing", "merged"])
-def test_a_run_killed_at_any_call_ends_as_if_it_had_not_been(tmp_path, fan_in):
-    with in_another_process(KILLED_RUNS, str(tmp_path), str(fan_in)) as process:
+def test_a_run_killed_at_any_call_ends_as_if_it_had_not_been(tmp_path):
+    """Of its six draws four are merged."""
+    with in_another_process(KILLED_RUNS, str(tmp_path), "2") as process:
         output, errors = process.communicate(timeout=LIMIT)
     assert process.returncode == 0, errors
     assert int(output) > 60  # so many places to die

@@ -27,36 +27,38 @@ KINDS = {
 
 
 def sample_kind(kind, **changes):
-    """A run long enough to be killed in its midst."""
     filter, settings = KINDS[kind]
-    arguments = {"draws": 6000, "tune": 3000, "discard_tuned_samples": False} | settings
+    arguments = {"draws": 700, "tune": 400, "discard_tuned_samples": False} | settings
     return sample_dram(state_space_model(filter), **with_kernel(arguments | changes))
 
 
-# With an argument it says when a chain begins and has made so many iterations, and waits there to
+# A run long enough to be killed in its midst.
+LONG = {"draws": 3000, "tune": 1000}
+
+# It says when a chain begins and has made so many iterations, and waits there to
 # be killed.
 KILLED = """
 import os, sys, time, warnings
 warnings.simplefilter("ignore")
 from pymc_statespace_filters.sampling.run import chain_task
-from tests.sampling.test_checkpoint_resume import sample_kind
+from tests.sampling.test_checkpoint_resume import LONG, sample_kind
 chain_task.CHECKPOINT_SECONDS = 0.01
 made = chain_task.ChainTask._advance
 def advance(self):
-    if self.n_done >= int(sys.argv[3]):
+    if self.n_done >= int(sys.argv[2]):
         os.write(1, b"there\\n")  # whole, whichever thread says it
         time.sleep(0.001 * (1 + self.n_done % 7))
     made(self)
 chain_task.ChainTask._advance = advance
-sample_kind(sys.argv[1], checkpoint=sys.argv[2], cores=2)
+sample_kind("estimated", checkpoint=sys.argv[1], cores=2, **LONG)
 print("done", flush=True)
 """
 
 
-def kill_after(kind, folder, iterations):
+def kill_after(folder, iterations):
     """Run in a process that is killed once a chain has made so many iterations."""
     child = subprocess.Popen(
-        [sys.executable, "-c", KILLED, kind, str(folder), str(iterations)],
+        [sys.executable, "-c", KILLED, str(folder), str(iterations)],
         stdout=subprocess.PIPE,
         text=True,
     )
@@ -66,17 +68,13 @@ def kill_after(kind, folder, iterations):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-@pytest.mark.parametrize(
-    "kind", [pytest.param("deterministic", marks=pytest.mark.slow), *list(KINDS)[1:]]
-)
-def test_killed_and_resumed(kind, tmp_path):
-    """At the start, within warm-up and within the draws: nothing shows in the end."""
-    for iterations in (0, 1800, 5500) if kind == "estimated" else (4000,):
-        kill_after(kind, tmp_path / "run", iterations)
+def test_killed_and_resumed(tmp_path):
+    """Within the draws: nothing shows in the end."""
+    kill_after(tmp_path / "run", 2500)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CheckpointWarning)  # killed while it wrote
-        found = sample_kind(kind, checkpoint=tmp_path / "run", cores=1)
-    expected = sample_kind(kind)
+        found = sample_kind("estimated", checkpoint=tmp_path / "run", cores=1, **LONG)
+    expected = sample_kind("estimated", **LONG)
     assert_identical(found, expected)
     assert found.attrs == expected.attrs
 
@@ -120,6 +118,28 @@ def test_a_segment_torn_anywhere(small, finished, tmp_path, often):
         assert_identical(found, expected)
         # It is mended: not a byte differs in what is stored of the draws.
         assert_identical(sample_dram(small, checkpoint=folder, **with_kernel(SMALL)), expected)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_dead_and_resumed(kind, tmp_path, often, monkeypatch):
+    """At the start, within warm-up and within the draws."""
+    blocks, advance = itertools.count(), chain_task.ChainTask._advance
+    fatal = {0, 3, 12}
+
+    def die(self):
+        if next(blocks) in fatal:
+            raise MemoryError("no more")
+        advance(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(chain_task.ChainTask, "_advance", die)
+        for _ in fatal:
+            with pytest.raises(MemoryError):
+                sample_kind(kind, checkpoint=tmp_path, cores=1)
+        found = sample_kind(kind, checkpoint=tmp_path, cores=1)
+    expected = sample_kind(kind)
+    assert_identical(found, expected)
+    assert found.attrs == expected.attrs
 
 
 def test_a_finished_run_returns_at_once(small, finished, monkeypatch):

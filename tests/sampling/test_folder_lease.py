@@ -16,6 +16,7 @@ from filelock import SoftFileLease
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling.checkpoint import lease
 from pymc_statespace_filters.sampling.checkpoint.lease import FolderLease, check_held
+from tests.sampling.alone import WITHOUT_PYMC
 from tests.sampling.lease_clock import lease_file, lease_of_elsewhere
 from tests.waiting import wait_until
 
@@ -24,9 +25,10 @@ with tempfile.TemporaryDirectory() as folder, SoftFileLease(Path(folder, "lease"
 
 HELD_IS_FIXED = pytest.mark.skipif(os.name == "nt", reason="what is held is not moved or removed")
 
-HOLDER = """
+HOLDER = f"""
 import sys, time
 from pathlib import Path
+{WITHOUT_PYMC}
 from pymc_statespace_filters.sampling.checkpoint.lease import FolderLease
 lease = FolderLease(Path(sys.argv[1]))
 print(flush=True)
