@@ -65,7 +65,27 @@ def mcse_of_chains(terms: Array) -> float:
     within = math.hypot(*(float(mcse(one[None], method="mean")) for one in terms)) / n_chains
     if (n_chains - 1) * between**2 <= chdtri(n_chains - 1, 1 - AGREE) * within**2:
         return pooled
-    return max(pooled, between * float(stdtrit(n_chains - 1, 0.975)) / 1.96)
+    return max(pooled, between * student_factor(n_chains))
+
+
+def mcse_of_populations(terms: Array, population: NDArray[np.int64]) -> float:
+    """Standard error of the mean of terms, each of an independent population, of any shapes.
+
+    From the spread of the means of the populations, which have as many draws as their evidence
+    says, with the factor of Student's interval of their number; infinite if there is only one.
+    """
+    _, index, sizes = np.unique(population.ravel(), return_inverse=True, return_counts=True)
+    if (count := len(sizes)) < 2:
+        return math.inf
+    shares = sizes / index.size
+    means = np.bincount(index, terms.ravel()) / sizes
+    spread = float((shares**2) @ (means - terms.mean()) ** 2)
+    return math.sqrt(spread * count / (count - 1)) * student_factor(count)
+
+
+def student_factor(count: int) -> float:
+    """How much wider than the normal one the 95 % interval from the spread of a few numbers is."""
+    return float(stdtrit(count - 1, 0.975)) / 1.96
 
 
 def disagreement(log_terms: Array) -> str:
@@ -106,6 +126,18 @@ def log_mean_of_independent(log_terms: Array) -> LogMean:
     if np.isneginf(value):
         return LogMean(-np.inf, np.inf)
     return LogMean(value, float(np.exp(log_terms - value).std() / len(log_terms) ** 0.5))
+
+
+def log_mean_of_truncated(log_terms: Array) -> LogMean:
+    """The mean of terms of which none exceeds the mean times the root of their number.
+
+    It errs to the lower side (Ionides 2008).
+    """
+    mean = log_mean_of_independent(log_terms)
+    if not np.isfinite(mean.value):
+        return mean
+    most = mean.value + 0.5 * math.log(len(log_terms))
+    return log_mean_of_independent(np.minimum(log_terms, most))
 
 
 def smoothed(log_weights: Array, r_eff: float = 1.0) -> tuple[Array, float]:

@@ -15,6 +15,7 @@ from ..errors import INSIDE, EvidenceWarning, ModelError
 from ..filters.protocol import Filter
 from ..parallel.cpu_affinity import cores_set_to
 from ..pymc_model.in_step import shared_by_ranks
+from ..pymc_model.posterior_draws import are_populations
 from ..system.checks import check_count, check_positive
 from .agreement import Agreement, assess_agreement
 from .estimators.bridge import Bridge
@@ -212,12 +213,14 @@ def estimate_evidence(
         "chib_jeliazkov", "bridge", "warp_bridge" and "laplace" are refused. By default the filter
         of the model.
     estimators : str, Estimator, or iterable of them, optional
-        By default "chib_jeliazkov" and "bridge". Names among "chib_jeliazkov", "bridge" (bridge
-        sampling to a normal distribution), "warp_bridge" (warp-III bridge sampling, for skewed
-        posteriors), "importance" (importance sampling from a mixture of Student-t distributions,
-        for several modes), "tempered_smc" (tempered sequential Monte Carlo from the prior, guided
-        by the draws), "prior_monte_carlo" (mean likelihood of prior draws, for few parameters) and
-        "laplace" (Laplace's approximation, without a standard error); or any
+        By default "chib_jeliazkov" and "bridge"; with draws of `sample_smc`, whose populations are
+        few independent ones, "importance", whose error they do not enter. Names among
+        "chib_jeliazkov", "bridge" (bridge sampling to a normal distribution), "warp_bridge"
+        (warp-III bridge sampling, for skewed posteriors), "importance" (importance sampling from a
+        mixture of Student-t distributions, for several modes), "tempered_smc" (tempered sequential
+        Monte Carlo from the prior, guided by the draws), "prior_monte_carlo" (mean likelihood of
+        prior draws, for few parameters) and "laplace" (Laplace's approximation, without a standard
+        error); or any
         `pymc_statespace_filters.evidence.estimators.Estimator`, built-in with other settings or
         your own.
     target_se : float
@@ -298,7 +301,8 @@ def estimate_evidence(
     True
     """
     if estimators is None:
-        estimators = DEFAULT if filter is None else "importance"
+        is_fit_enough = filter is not None or are_populations(idata)
+        estimators = "importance" if is_fit_enough else DEFAULT
     selected = _select_estimators(estimators, check_positive("target_se", target_se))
     if filter is not None:
         _check_guided(selected)

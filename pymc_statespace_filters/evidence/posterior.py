@@ -13,15 +13,17 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import pymc as pm
 import xarray as xr
+from arviz_stats import ess
 from numpy.typing import NDArray
 
 from ..errors import DataMismatchError, ModelError
 from ..filters.outcomes import Failure, why_zero
+from ..importance import LogMean, log_mean, mcse_of_chains, mcse_of_populations
 from ..pymc_model.aligned_axes import records_of_rows
 from ..pymc_model.density import ModelDensity
 from ..pymc_model.filter_estimates import failures_at
 from ..pymc_model.inspection import scored_rows
-from ..pymc_model.posterior_draws import are_populations, check_one_model, unconstrained_draws
+from ..pymc_model.posterior_draws import check_one_model, populations_of, unconstrained_draws
 from ..pymc_model.prior import ModelPrior
 from ..pymc_model.random_variable import PanelRV
 
@@ -62,8 +64,9 @@ class Posterior:
         ``failures(x)`` counts why the likelihood is zero at points x (m, k).
     prior : Prior, optional
         The likelihood is the log-density of `evaluate` minus that of the prior.
-    of_populations : bool
-        Whether the chains are populations of particles: see `are_populations`.
+    population : ndarray of int (chain, draw), optional
+        The population of each draw, if they are particles: see `are_populations`. The draws of one
+        have common ancestors, so that only populations are independent.
     shared_seed : tuple of int, optional
         Seed of the points whose log-densities several estimators use. Without it each estimator
         evaluates points of its own.
@@ -77,7 +80,7 @@ class Posterior:
     is_noisy: bool = False
     prior: Prior | None = None
     failures: Callable[[Array], Counter[Failure]] | None = None
-    of_populations: bool = False
+    population: NDArray[np.int64] | None = None
     shared_seed: tuple[int, ...] | None = None
     shared: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
@@ -97,7 +100,27 @@ class Posterior:
 
     def worst_disagreement(self, found: Iterable[str]) -> list[str]:
         """The worst of what chains disagree about, if they are chains; those that agree are ""."""
-        return [] if self.of_populations else sorted({one for one in found if one})[-1:]
+        if self.population is not None:
+            return []
+        return sorted({one for one in found if one})[-1:]
+
+    def mcse(self, terms: Array) -> float:
+        """Standard error of the mean of terms (chain, draw), one of each draw."""
+        if self.population is None:
+            return mcse_of_chains(terms)
+        return mcse_of_populations(terms, self.population)
+
+    def ess(self, terms: Array) -> float:
+        """How many independent draws the mean of terms (chain, draw) is worth, at least one."""
+        if self.population is None:
+            return float(ess(terms, method="mean"))
+        error = self.mcse(terms)
+        return max(1.0, float(terms.var()) / error**2) if error > 0 else float(terms.size)
+
+    def log_mean(self, log_terms: Array) -> LogMean:
+        """Log of the mean of positive terms (chain, draw), one of each draw, with its error."""
+        value = log_mean(log_terms)
+        return LogMean(value, self.mcse(np.exp(log_terms - value)))
 
     def why_zero(self, x: Array) -> str:
         """Why the likelihood is zero at most of some prior draws x (m, k), and what to do."""
@@ -105,17 +128,52 @@ class Posterior:
         return why_zero(Counter() if self.failures is None else self.failures(x), len(x))
 
     def halves(self) -> tuple["Posterior", "Posterior"]:
-        """Split every chain into its first and second half."""
+        """Split every chain into its first and second half; of populations, half of these.
+
+        Raises
+        ------
+        ModelError
+            If all draws are of one population.
+        """
+        if self.population is not None:
+            return self._halves_of_populations(self.population)
         middle = self.draws.shape[1] // 2
-        return (
-            replace(self, draws=self.draws[:, :middle], log_density=self.log_density[:, :middle]),
-            replace(self, draws=self.draws[:, middle:], log_density=self.log_density[:, middle:]),
+        return self._at(np.s_[:, :middle]), self._at(np.s_[:, middle:])
+
+    def _halves_of_populations(
+        self, population: NDArray[np.int64]
+    ) -> tuple["Posterior", "Posterior"]:
+        """The populations dealt out in the order of their sizes, each half as one chain."""
+        labels, sizes = np.unique(population, return_counts=True)
+        if len(labels) < 2:
+            raise ModelError(
+                "draws must be of several populations, got all of one, whose evidence is far above "
+                'that of the others: use estimators="importance", or raise draws of sample_smc'
+            )
+        order = labels[np.argsort(-sizes, kind="stable")]
+        is_first = np.isin(population, [*order[::4], *order[3::4]])
+        first, second = (np.nonzero(mask) for mask in (is_first, ~is_first))
+        return self._at(tuple(one[None] for one in first)), self._at(
+            tuple(one[None] for one in second)
         )
 
     def thinned(self, most: int) -> "Posterior":
         """Thin every chain evenly, so that about `most` draws remain in all, or fewer."""
-        step = -(-self.log_density.size // most)
-        return replace(self, draws=self.draws[:, ::step], log_density=self.log_density[:, ::step])
+        return self.every(-(-self.log_density.size // most))
+
+    def every(self, step: int) -> "Posterior":
+        """One of so many draws of every chain."""
+        return self._at(np.s_[:, ::step])
+
+    def _at(self, index: Any) -> "Posterior":
+        """The draws at an index of the axes chain and draw."""
+        population = None if self.population is None else self.population[index]
+        return replace(
+            self,
+            draws=self.draws[index],
+            log_density=self.log_density[index],
+            population=population,
+        )
 
 
 def log_likelihood_of(log_density: Array, log_prior: Array) -> Array:
@@ -183,7 +241,7 @@ def build_posterior(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterio
 
     prior = ModelPrior(density.model)
     failures = partial(failures_at, density.model)
-    facts = not held, prior, failures, are_populations(idata)
+    facts = not held, prior, failures, populations_of(idata)
     return Posterior(draws, log_density, evaluate, *facts), noise
 
 

@@ -1,6 +1,6 @@
 """The arguments of a run, checked, and what all runs have in common."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from typing import Any, NamedTuple, Self
 
@@ -84,11 +84,15 @@ class Request(NamedTuple):
 
 
 class Run(NamedTuple):
-    """What a run has led to: the particles, the evidence by each population, and its course."""
+    """What a run has led to: the particles, the evidence by each population, and its course.
+
+    ``missed`` says of the posterior what the particles lack.
+    """
 
     cloud: Cloud
     log_evidences: NDArray[np.float64]  # (R,)
     course: xr.Dataset
+    missed: Sequence[str] = ()
 
 
 def checked_request(

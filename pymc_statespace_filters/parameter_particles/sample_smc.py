@@ -29,7 +29,7 @@ from .sequential_output import finished
 from .sequential_run import Progress
 from .stored_run import progress_of_arrays
 from .stored_steps import StoredSteps, steps_stored_in
-from .whole_data import WholeLikelihood, tempered_run
+from .whole_data import WholeLikelihood, missed_in, tempered_run
 
 _MAXIMUM = 2**32 + 1  # key of random numbers beside those of the run
 
@@ -90,6 +90,8 @@ def sample_smc(
     compute_convergence_checks : bool
         Whether to compare filters that are not exact with unbiased ones at the end, if there are
         600 particles or more; see `check_filter`. Ctrl-C ends the comparison without an outcome.
+        Also, with "tempered", whether to look for modes that the particles have missed, from
+        points on their way, by at most 12 % more evaluations.
     checkpoint : str or path, optional
         A folder in which the particles are stored every few seconds, after a stage of "tempered" or
         a row of "sequential". If the process ends for any reason, the same call goes on from there,
@@ -110,16 +112,18 @@ def sample_smc(
         Monte Carlo standard error of every posterior mean, from the spread of the populations:
         effective sample sizes of ArviZ do not hold for particles. ``smc`` has the course of the
         run: of "tempered" for each ``stage`` the ``temperature``, ``effective_size`` (population,
-        stage), ``acceptance``, number ``n_steps`` and relative length ``scale`` of the moves; of
-        "sequential" for each ``row`` the ``score``, log p(d_j | d_1 .. d_{j-1}) with the parameters
-        integrated out, ``score_se``, ``score_deviation`` (population, row),
-        ``pit`` (row, observable), ``effective_size``, the particles ``n_alive`` of positive
+        stage), ``acceptance``, number ``n_steps`` and relative length ``scale`` of the moves, and
+        the points ``n_evaluated``; of "sequential" for each ``row`` the ``score``,
+        log p(d_j | d_1 .. d_{j-1}) with the parameters integrated out, ``score_se``,
+        ``score_deviation`` (population, row), ``pit`` (row, observable), ``effective_size``, the
+        particles ``n_alive`` of positive
         likelihood before moves (population, row), the number ``n_stages`` of moves, ``acceptance``,
         ``n_members`` of the filter, ``variance`` of the log-likelihood where it was measured, and
         the cost, ``n_updates`` of filters. ``evidence`` holds the evidence, as
         `estimate_evidence` stores it, with the estimator "smc"; the attributes ``log_evidence`` and
         ``log_evidence_se`` repeat it, and ``filter_check``, a JSON text, has the outcome of the
-        comparison of filters. ``smc_state``, of "sequential", is what `extend` goes on
+        comparison of filters; ``unvisited``, another one, is there if the particles have missed a
+        mode, and says so. ``smc_state``, of "sequential", is what `extend` goes on
         from.
 
     Raises
@@ -139,8 +143,9 @@ def sample_smc(
     Warns
     -----
     EvidenceWarning
-        If the evidences of the populations differ so much that a few decide, if moves are rarely
-        accepted, or if a prior is not normalised.
+        If the evidences of the populations differ so much that a few decide, if a mode holds more
+        of the posterior than of the particles, if moves are rarely accepted, or if a prior is not
+        normalised.
     FilterWarning
         If a filter is found to be off; the evidence keeps this doubt.
 
@@ -219,8 +224,9 @@ def sample_smc(
         doubts_of: DoubtsOf = not_checked
         if checks:
             doubts_of = checked_at_end(model, own, progressbar=progressbar)
-        run = _tempered if data == "tempered" else _sequential
-        return run(model, own, screen, doubts_of, steps, progressbar)
+        if data == "sequential":
+            return _sequential(model, own, screen, doubts_of, steps, progressbar)
+        return _tempered(model, own, screen, doubts_of, steps, progressbar, looks=checks)
 
 
 def _check_screen(screen: Any) -> None:
@@ -237,10 +243,14 @@ def _tempered(
     doubts_of: DoubtsOf,
     steps: StoredSteps,
     progressbar: bool,
+    *,
+    looks: bool,
 ) -> xr.DataTree:
     began, likelihood = perf_counter(), WholeLikelihood(model, screen)
     with stage_progress(1.0, enabled=progressbar) as show:
-        run = tempered_run(model, likelihood, request, show, steps)
+        run, visited = tempered_run(model, likelihood, request, show, steps)
+        if looks:
+            run = run._replace(missed=missed_in(run, visited, model, likelihood, request))
         maximum = _maximum(likelihood.factors, run, request)
     seconds = perf_counter() - began
     observed = observed_in(model)

@@ -13,9 +13,15 @@ from ..pymc_model.other_filter import model_with
 from ..pymc_model.prior import ModelFactors
 from ..smc.bridge import Cloud, Crossed, Stage, cross
 from ..smc.particles import Evaluate, Particles
+from ..unvisited.modes import Visited, joined, missed_mode
+from ..unvisited.sentences import sentence_of_mode
 from .request import Request, Run, check_alive
 from .stored_run import arrays_of_cloud, cloud_of_arrays
 from .stored_steps import StoredSteps
+
+MOST_VISITED = 10_000  # points of a stage that are kept
+LOOK = 0.12  # of the evaluations of a run, that may go into a look for what it has missed
+_LOOK = 2**32 + 3  # key of random numbers beside those of the run
 
 Array = NDArray[np.float64]
 
@@ -51,19 +57,27 @@ def tempered_run(
     request: Request,
     show: Callable[[float, str], None],
     steps: StoredSteps,
-) -> Run:
-    """Lead draws of the prior to the posterior, or particles from where they were stored."""
+) -> tuple[Run, Visited]:
+    """Lead draws of the prior to the posterior, or particles from where they were stored.
+
+    Also returns points of all stages.
+    """
     rng = request.generator(0)
     begin: Cloud | Crossed
     if steps.found:
-        begin = _restored(steps.found, rng)
+        begin, visited = _restored(steps.found, rng), [_visited_before(steps.found)]
     else:
         begin = request.cloud(likelihood.draw(request.n_particles, rng))
         check_alive(model, begin)
+        visited = [_visited(begin, 0)]
 
     def on_stage(so_far: Crossed) -> None:
         stage = so_far.stages[-1]
-        steps.save(lambda: _stored(so_far, rng) | request.arrays, is_last=stage.temperature == 1.0)
+        visited.append(_visited(so_far.cloud, len(so_far.stages)))
+        steps.save(
+            lambda: _stored(so_far, joined(visited), rng) | request.arrays,
+            is_last=stage.temperature == 1.0,
+        )
         sizes = f"effective size {stage.effective_sizes.mean():.0f}"
         text = f"temperature {stage.temperature:.3g}, {sizes}, acceptance {stage.acceptance:.2f}"
         show(stage.temperature, text)
@@ -77,15 +91,51 @@ def tempered_run(
         screen=likelihood.screen,
         on_stage=on_stage,
     )
-    return Run(found.cloud, found.log_ratio, _course(found.stages))
+    return Run(found.cloud, found.log_ratio, _course(found.stages)), joined(visited)
 
 
-def _stored(so_far: Crossed, rng: np.random.Generator) -> dict[str, np.ndarray]:
+def missed_in(
+    run: Run, visited: Visited, model: pm.Model, likelihood: WholeLikelihood, request: Request
+) -> list[str]:
+    """What the particles of a run lack of the posterior, at the price of a part of the run."""
+    n_evaluated = request.n_particles + int(run.course["n_evaluated"].sum())
+
+    def evaluate(x: Array, rng: np.random.Generator) -> Array:
+        found = likelihood.evaluate(x, rng).log_density(1.0)
+        return np.where(np.isnan(found), -np.inf, found)
+
+    missed = missed_mode(
+        run.cloud.others,
+        run.log_evidences,
+        visited,
+        evaluate,
+        int(LOOK * n_evaluated),
+        request.generator(_LOOK),
+    )
+    return [] if missed is None else [sentence_of_mode(model, missed, request.draws)]
+
+
+def _visited(cloud: Cloud, stage: int) -> Visited:
+    """Points of a stage, at most `MOST_VISITED`."""
+    parts = [one.particles for one in (cloud.pilot, cloud.others)]
+    x = np.concatenate([one.x for one in parts])
+    log_density = np.concatenate([one.log_density(1.0) for one in parts])
+    alive = np.flatnonzero(np.isfinite(log_density))
+    kept = alive[:: max(1, -(-len(alive) // MOST_VISITED))]
+    return Visited(x[kept], log_density[kept], np.full(len(kept), stage))
+
+
+def _visited_before(arrays: Mapping[str, np.ndarray]) -> Visited:
+    return Visited(*(arrays[f"visited_{name}"] for name in Visited._fields))
+
+
+def _stored(so_far: Crossed, visited: Visited, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """How far a run is, and its next random numbers, as arrays."""
     columns = zip(*so_far.stages, strict=True)
     stages = {f"stages_{name}": np.array(c) for name, c in zip(Stage._fields, columns, strict=True)}
     generator = np.array(json.dumps(rng.bit_generator.state))
     found = {"log_ratio": so_far.log_ratio, "generator": generator}
+    found |= {f"visited_{name}": values for name, values in visited._asdict().items()}
     return arrays_of_cloud(so_far.cloud) | stages | found
 
 
@@ -104,6 +154,7 @@ def _course(stages: list[Stage]) -> xr.Dataset:
         "n_steps": [one.n_steps for one in stages],
         "acceptance": [one.acceptance for one in stages],
         "scale": [one.scale for one in stages],
+        "n_evaluated": [one.n_evaluated for one in stages],
     }
     found = xr.Dataset({name: ("stage", values) for name, values in columns.items()})
     sizes = np.stack([one.effective_sizes for one in stages], axis=1)

@@ -51,6 +51,19 @@ def are_populations(idata: xr.DataTree | None) -> bool:
     return idata is not None and idata.attrs.get("sampler") == BY_PARTICLES
 
 
+def populations_of(idata: xr.DataTree) -> NDArray[np.int64] | None:
+    """The population of each draw (chain, draw); None of draws of chains.
+
+    Without the group that has it, it is the chain, which is nearly a population.
+    """
+    if not are_populations(idata):
+        return None
+    if "sample_stats" in idata.children and "population" in idata["sample_stats"]:
+        return idata["sample_stats"]["population"].transpose("chain", "draw").values
+    sizes = idata["posterior"].sizes
+    return np.broadcast_to(np.arange(sizes["chain"])[:, None], (sizes["chain"], sizes["draw"]))
+
+
 def check_one_model(idata: xr.DataTree, model: pm.Model) -> None:
     """Raise unless the draws can be those of the posterior of a model.
 

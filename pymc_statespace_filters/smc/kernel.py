@@ -84,17 +84,17 @@ def fitted_kernel(
             "particles are left, which do not vary in every direction; raise draws, or narrow the "
             "priors"
         )
-    mixture = _fitted_mixture(found, rng).with_defensive_component()
-    return Kernel(found.chol, mixture.affine(found.mean, found.chol), scale, screen)
+    return Kernel(found.chol, fitted_mixture(found, rng), scale, screen)
 
 
-def _fitted_mixture(found: Standardised, rng: np.random.Generator) -> StudentMixture:
-    """A mixture of as many components as describe held-out points best."""
+def fitted_mixture(found: Standardised, rng: np.random.Generator) -> StudentMixture:
+    """A mixture of as many components as describe held-out points best, and a wide one."""
     first, second = np.array_split(found.z, 2)
     n, k = found.z.shape
     most = max(1, n // (2 * POINTS_OF_A_COMPONENT * k))
     numbers = [one for one in NUMBERS_OF_COMPONENTS if one <= most]
-    return fit_mixture(found.z, likeliest_mixture(first, second, numbers, rng))
+    mixture = fit_mixture(found.z, likeliest_mixture(first, second, numbers, rng))
+    return mixture.with_defensive_component().affine(found.mean, found.chol)
 
 
 def metropolis(

@@ -8,17 +8,12 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp, stdtrit
+from scipy.special import logsumexp
 
-from ..importance import normalised, systematic
+from ..importance import normalised, student_factor, systematic
 from .particles import Populations
 
 Array = NDArray[np.float64]
-
-
-def student_factor(count: int) -> float:
-    """How much wider than the normal one the 95 % interval from the spread of a few numbers is."""
-    return float(stdtrit(count - 1, 0.975)) / 1.96
 
 
 def merged_log_evidence(log_evidences: Array) -> tuple[Array, Array]:

@@ -1,1 +1,1 @@
-"""Whether chains have left parts of the posterior unvisited: a check by importance sampling."""
+"""Whether chains or particles have left parts of the posterior unvisited: importance sampling."""

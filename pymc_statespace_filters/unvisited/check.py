@@ -32,6 +32,7 @@ from ..importance import (
     bridge_constant,
     log_mean_of_chains,
     log_mean_of_independent,
+    log_mean_of_truncated,
     mcse_of_chains,
 )
 from .tail_proposals import SIZES, Evaluate, Tail, WeightedPoints, weighted_points
@@ -192,7 +193,7 @@ def _compared(
     if not 0 < share < 1:  # a chain that stands still may be all of a small tail
         return MissedTail(tail, share, 0.0, 0.0, draws[0, 0], draws[0, 0])
     x, order = draws[inside], np.argsort(distance[inside])
-    mass = _truncated(np.where(tail.distance(points.x) > 0, points.log_weights, -np.inf))
+    mass = log_mean_of_truncated(np.where(tail.distance(points.x) > 0, points.log_weights, -np.inf))
     posterior = errors = 0.0
     if mass.n_effective > MIN_EFFECTIVE:
         ratio = math.exp(min(mass.value - log_evidence.value, 50.0)) / (1 - share)
@@ -204,13 +205,3 @@ def _compared(
         of_draws *= math.sqrt(max(spread / (share * (1 - share)), 1.0))
         errors = (posterior - share) / math.hypot(of_masses, of_draws)
     return MissedTail(tail, share, posterior, errors, x[order[0]], x[order[-1]])
-
-
-def _truncated(log_weights: Array) -> LogMean:
-    """The mean of weights of which none exceeds the mean times the root of their number."""
-    mean = log_mean_of_independent(log_weights)
-    if not np.isfinite(mean.value):
-        return mean
-    return log_mean_of_independent(
-        np.minimum(log_weights, mean.value + 0.5 * math.log(len(log_weights)))
-    )

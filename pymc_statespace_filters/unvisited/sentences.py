@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 from ..pymc_model.density import ConstrainedValues
 from ..pymc_model.elements import element_names
 from .check import MissedTail, missed_tails
+from .modes import MissedMode
 from .tail_proposals import Evaluate
 
 ATTRIBUTE = "unvisited"  # of results, a JSON text
+N_SHOWN = 4  # elements of a point
 N_TIMED, N_PARTS = 20, 3  # evaluations whose time is measured; a pause may fall into one part
 
 Array = NDArray[np.float64]
@@ -70,6 +72,28 @@ def _sentence(model: pm.Model, missed: MissedTail) -> str:
         "evidence lack it; reparametrise the model there (a non-centred form of a hierarchical "
         "one), or draw longer chains with smaller steps"
     )
+
+
+def sentence_of_mode(model: pm.Model, missed: MissedMode, draws: int) -> str:
+    """Say where particles lack a part of the posterior, of populations of so many draws."""
+    return (
+        f"the particles have missed a part of the posterior around {_point(model, missed.centre)}: "
+        f"{missed.particles:.1%} of them lie there, and at least {missed.posterior:.1%} of the "
+        f"posterior ({missed.errors:.1f} standard errors more), so that means, intervals and the "
+        f"evidence lack it; raise draws, now {draws}, to several times as many, or reparametrise "
+        "the model there (a non-centred form of a hierarchical one)"
+    )
+
+
+def _point(model: pm.Model, x: Array) -> str:
+    """The first values of a point in the model's units; unconstrained if it has more elements."""
+    names = element_names(model)
+    values = np.concatenate([np.ravel(value) for value in ConstrainedValues(model)(x).values()])
+    which = ""
+    if len(values) != len(x):
+        values, which = x, ", unconstrained"
+    shown = [f"{n} = {v:.3g}" for n, v in zip(names[:N_SHOWN], values, strict=False)]
+    return ", ".join([*shown, *(["..."] if len(names) > N_SHOWN else [])]) + which
 
 
 def _where(model: pm.Model, missed: MissedTail) -> str:

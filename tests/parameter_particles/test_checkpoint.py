@@ -5,16 +5,14 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import DataMismatchError
-from pymc_statespace_filters.parameter_particles import stored_steps
+from pymc_statespace_filters.parameter_particles import stored_steps, whole_data
 from pymc_statespace_filters.parameter_particles.observed_rows import ObservedRows
 from pymc_statespace_filters.parameter_particles.stored_steps import StoredSteps
 from pymc_statespace_filters.parameter_particles.whole_data import WholeLikelihood
+from pymc_statespace_filters.unvisited.modes import MissedMode
 from tests.parameter_particles.autoregression import DATA, model
 
-SETTINGS = {
-    "draws": 20, "populations": 2, "random_seed": 2, "progressbar": False,
-    "compute_convergence_checks": False,
-}  # fmt: skip
+SETTINGS = {"draws": 20, "populations": 2, "random_seed": 2, "progressbar": False}
 KINDS = {
     "tempered": {"data": "tempered"},
     "sequential": {"data": "sequential", "inner": psf.BootstrapPF(6)},
@@ -25,6 +23,11 @@ pytestmark = pytest.mark.filterwarnings("ignore:the log-evidence")  # few partic
 
 class Ended(BaseException):
     """What ends a process."""
+
+
+def found_among(populations, log_evidences, visited, evaluate, n_evaluations, rng):
+    """A mode at the mean of all points on the way."""
+    return MissedMode(visited.x.mean(axis=0), 0.0, rng.random(), float(len(visited.x)))
 
 
 @pytest.fixture
@@ -48,7 +51,11 @@ def ending_after(n_steps, monkeypatch):
 
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_a_run_goes_on_where_it_ended(kind, often, tmp_path, monkeypatch):
-    """It ends twice; when it is complete, another call reads it."""
+    """It ends twice; when it is complete, another call reads it.
+
+    The look for modes that were missed is at all points on the way, those before an end included.
+    """
+    monkeypatch.setattr(whole_data, "missed_mode", found_among)
     settings = {**SETTINGS, **KINDS[kind], "model": model(psf.EKF(), 9)}
     whole = psf.sample_smc(**settings)
     for _ in range(2):
@@ -60,6 +67,8 @@ def test_a_run_goes_on_where_it_ended(kind, often, tmp_path, monkeypatch):
     for of in (ObservedRows, WholeLikelihood):
         monkeypatch.delattr(of, "drawn" if of is ObservedRows else "draw")
     complete = psf.sample_smc(**settings, checkpoint=tmp_path)
+    if kind == "tempered":
+        assert "have missed" in whole.attrs["unvisited"]
     for found in (resumed, complete):
         assert found.attrs == whole.attrs
         for name in whole.children:

@@ -1,5 +1,7 @@
 """Tempered runs of PyMC models against exact evidences and posteriors."""
 
+import json
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +11,7 @@ import xarray as xr
 from scipy.stats import multivariate_normal
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.parameter_particles.output import _doubts
 from pymc_statespace_filters.parameter_particles.request import Run
 from pymc_statespace_filters.pymc_model.density import ModelDensity
@@ -120,6 +122,38 @@ def test_populations_that_differ_and_moves_that_fail_are_doubts():
     assert "a few of them decide" in doubts
     assert "rarely accepted (1.0% at worst)" in doubts
     assert not list(_doubts(Run(None, np.array([0.0, -0.1, 0.2]), course[{"stage": [0]}])))
+
+
+def needle():
+    """A wide well and one of mass 0.3 that is a hundredth as wide as the prior."""
+    with pm.Model() as built:
+        x = pm.Normal("x", 0, 10, shape=2)
+
+        def well(mass, mean, sd):
+            return np.log(mass) + pm.logp(pm.Normal.dist(mean, sd), x).sum()
+
+        parts = well(0.7, [-4.0, 0.0], 1.0), well(0.3, [4.0, 0.0], 0.08)
+        pm.Potential("wells", pm.math.logaddexp(*parts) - well(1.0, 0.0, 10.0))
+    return built
+
+
+def test_a_mode_that_all_populations_have_lost_is_a_doubt():
+    settings = {"model": needle(), "random_seed": 3, "progressbar": False}
+    with pytest.warns(EvidenceWarning, match="missed a part of the posterior") as caught:
+        idata = psf.sample_smc(200, **settings)
+    assert [one.filename for one in caught] == [__file__]
+    assert (idata["posterior"]["x"][..., 0] < 0).all()
+    (said,) = json.loads(idata.attrs["unvisited"])
+    assert re.search(r"around x\[0\] = (4|4\.0\d|3\.9\d), x\[1\] = .*0\.0% of them lie there", said)
+    assert said in str(idata["evidence"]["doubts"].values)
+    with pytest.warns(EvidenceWarning, match="missed a part of the posterior"):
+        found = psf.estimate_evidence(
+            idata, estimators="importance", **settings | {"random_seed": 1}
+        )
+    assert said in found["importance"].doubts
+    unchecked = psf.sample_smc(200, compute_convergence_checks=False, **settings)
+    assert "unvisited" not in unchecked.attrs
+    assert unchecked["posterior"].to_dataset().equals(idata["posterior"].to_dataset())
 
 
 def test_populations_with_hardly_a_particle_of_positive_likelihood_are_a_doubt():

@@ -40,11 +40,10 @@ draw has the noise of the chain, its image fresh noise.
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from arviz_stats import ess, mcse
 from numpy.typing import NDArray
 from scipy.special import expit, log_expit
 from scipy.stats import Covariance, multivariate_normal
@@ -54,7 +53,6 @@ from ...importance import (
     LogMean,
     bridge_constant,
     disagreement,
-    log_mean_of_chains,
     log_mean_of_independent,
 )
 from ..posterior import Posterior, check_overlap
@@ -163,8 +161,7 @@ class _Plain:
     def bridged(self, n_proposals: int, rng: np.random.Generator) -> "_Fold":
         """Bridge from the draws to the first proposals."""
         return _bridge(
-            self._averaged.draws,
-            self._averaged.log_density,
+            self._averaged,
             *self._q.first(n_proposals),
             q=self._q.moments,
             pooled=self._pooled,
@@ -195,10 +192,10 @@ class _Warped:
         chosen[:, ::step] = True
         new = chosen & np.isnan(self._image_of_draw)
         self._image_of_draw[new] = self._evaluate_images(self._averaged.draws[new], rng)
-        at_draws = self._averaged.log_density[:, ::step]
+        averaged = self._averaged.every(step)
+        at_both = np.logaddexp(averaged.log_density, self._image_of_draw[:, ::step])
         return _bridge(
-            self._averaged.draws[:, ::step],
-            np.logaddexp(at_draws, self._image_of_draw[:, ::step]) - math.log(2),
+            replace(averaged, log_density=at_both - math.log(2)),
             proposals,
             np.logaddexp(at_proposals, self._image_of_proposal) - math.log(2),
             q=self._q.moments,
@@ -230,31 +227,33 @@ def _errors(folds: Sequence[_Fold]) -> tuple[float, float]:
 
 
 def _bridge(
-    draws: Array,
-    log_density: Array,
+    averaged: Posterior,
     proposals: Array,
     at_proposals: Array,
     *,
     q: Whitening,
     pooled: Whitening,
 ) -> _Fold:
-    """Bridge from draws (chain, draw, k) to proposals (m, k), given their log-densities.
+    """Bridge from draws to proposals (m, k), given their log-densities.
 
     `pooled` is the normal distribution fitted to all draws.
     """
     check_overlap(at_proposals)
     normal = _normal(q)
-    flat = draws.reshape(-1, draws.shape[-1])
+    flat, log_density = averaged.draws.reshape(-1, len(q.mean)), averaged.log_density
     log_q = normal.logpdf(flat).reshape(log_density.shape)
     log_pooled = _normal(pooled).logpdf(flat).reshape(log_density.shape)
     return _bridge_ratios(
         log_density - log_q,
         at_proposals - normal.logpdf(proposals),
         pooled=log_density - log_pooled,
+        averaged=averaged,
     )
 
 
-def _bridge_ratios(at_draws: Array, at_proposals: Array, *, pooled: Array) -> _Fold:
+def _bridge_ratios(
+    at_draws: Array, at_proposals: Array, *, pooled: Array, averaged: Posterior
+) -> _Fold:
     """Bridge from log-ratios l = f - ln q at draws (chain, draw) to those at proposals (m,).
 
     `pooled` is what `at_draws` would be under the q fitted to all draws.
@@ -262,14 +261,14 @@ def _bridge_ratios(at_draws: Array, at_proposals: Array, *, pooled: Array) -> _F
     log_odds = math.log(at_draws.size / at_proposals.size)
     shift = log_odds - bridge_constant(at_draws, at_proposals, log_odds)
     # One fixed-point step suffices: the effective sample size depends only weakly on itself.
-    n_effective = float(ess(expit(-at_draws - shift), method="mean"))
+    n_effective = averaged.ess(expit(-at_draws - shift))
     log_odds = math.log(n_effective / at_proposals.size)
     log_evidence = bridge_constant(at_draws, at_proposals, log_odds)
     shift = log_odds - log_evidence
 
     terms = expit(-at_draws - shift)
-    draws = log_mean_of_chains(log_expit(-at_draws - shift))
-    moved = float(mcse(terms - expit(-pooled - shift), method="mean") / terms.mean())
+    draws = averaged.log_mean(log_expit(-at_draws - shift))
+    moved = averaged.mcse(terms - expit(-pooled - shift)) / float(terms.mean())
     return _Fold(
         log_evidence,
         draws=draws,

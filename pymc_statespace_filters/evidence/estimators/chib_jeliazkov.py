@@ -44,7 +44,6 @@ from ...importance import (
     MIN_EFFECTIVE,
     LogMean,
     disagreement,
-    log_mean_of_chains,
     log_mean_of_independent,
 )
 from ...system.checks import check_count
@@ -208,7 +207,7 @@ def estimate_in_one_block(
     # Numerator: the draws, with the log-densities stored by the chain.
     log_terms = proposal.log_alpha_to_center(posterior.log_density)
     log_terms = log_terms + proposal.log_q(posterior.draws)
-    numerator = log_mean_of_chains(log_terms)
+    numerator = posterior.log_mean(log_terms)
 
     # Denominator: draws from q(x*, .), with fresh log-densities.
     ratio = 0.0 if target_se is None else ratio_of_errors(target_se, numerator.error)

@@ -172,6 +172,7 @@ def exact_posterior(
         log_density=np.maximum(log_density, least),
         evaluate=density.evaluate_afresh,
         is_noisy=density.n_noisy > 0,
+        population=None,  # resampled over all of them
     )
 
 

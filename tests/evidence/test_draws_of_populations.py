@@ -1,0 +1,101 @@
+"""Estimates from draws of `sample_smc`, of which only the populations are independent."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.stats import norm
+
+from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.evidence import estimation
+from pymc_statespace_filters.evidence.estimators.bridge import Bridge
+from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
+from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.importance import mcse_of_populations
+from pymc_statespace_filters.pymc_model.posterior_draws import BY_PARTICLES, populations_of
+
+R, N, SCATTER = 8, 100, 0.4
+
+
+def log_density(x):
+    return norm.logpdf(x).sum(axis=-1)
+
+
+def particles(rng):
+    """Draws of N(0, 1) in 4 chains, of populations of unequal sizes with means of their own."""
+    population = np.sort(rng.choice(R, size=R * N, p=np.arange(1, R + 1) / (R * (R + 1) / 2)))
+    means = SCATTER * rng.standard_normal((R, 2))
+    within = np.sqrt(1 - SCATTER**2) * rng.standard_normal((R * N, 2))
+    x = (means[population] + within).reshape(4, -1, 2)
+    return Posterior(
+        x, log_density(x), lambda x, rng: log_density(x), population=population.reshape(4, -1)
+    )
+
+
+@pytest.mark.parametrize("estimator", [Bridge(), Bridge(warped=True), ChibJeliazkov()])
+def test_errors_are_those_of_few_independent_populations(estimator):
+    """Each error is known to a fifth or so; the mean square of 60 z is below 2 nearly always."""
+    rng, z = np.random.default_rng(3), []
+    for _ in range(60):
+        found = estimator.estimate(particles(rng), rng=rng)
+        z.append(found.log_evidence / found.se)
+    assert 0.3 < np.mean(np.square(z)) < 2.0
+
+
+def test_halves_have_no_population_in_common():
+    posterior = particles(np.random.default_rng(1))
+    halves = posterior.halves()
+    labels = [set(np.unique(half.population)) for half in halves]
+    assert not labels[0] & labels[1]
+    assert labels[0] | labels[1] == set(range(R))
+    sizes = [half.log_density.size for half in halves]
+    assert sum(sizes) == R * N
+    assert min(sizes) > 0.4 * R * N
+    for half in halves:
+        np.testing.assert_array_equal(half.log_density, log_density(half.draws))
+    thinned = posterior.thinned(80)
+    assert thinned.population.shape == thinned.log_density.shape == (4, 20)
+
+
+def test_draws_of_one_population_have_no_error():
+    posterior = particles(np.random.default_rng(1))
+    alone = Posterior(
+        posterior.draws,
+        posterior.log_density,
+        posterior.evaluate,
+        population=np.zeros_like(posterior.population),
+    )
+    assert np.isinf(alone.mcse(alone.log_density))
+    with pytest.raises(ModelError, match="got all of one"):
+        Bridge().estimate(alone, rng=np.random.default_rng(1))
+
+
+def test_the_error_of_a_mean_is_that_of_unequal_clusters():
+    terms, population = np.array([1.0, 3.0, 5.0, 5.0]), np.array([0, 0, 1, 1])
+    expected = np.sqrt(2 * (0.25 * 1.5**2 * 2)) * 12.706 / 1.96
+    assert mcse_of_populations(terms, population) == pytest.approx(expected, rel=1e-3)
+
+
+def test_populations_are_read_from_the_result():
+    posterior = xr.Dataset({"x": (("chain", "draw"), np.zeros((2, 3)))})
+    tree = xr.DataTree.from_dict({"posterior": posterior})
+    assert populations_of(tree) is None
+    tree.attrs["sampler"] = BY_PARTICLES
+    assert populations_of(tree).tolist() == [[0, 0, 0], [1, 1, 1]]
+    stats = xr.Dataset({"population": (("chain", "draw"), [[0, 0, 0], [0, 1, 1]])})
+    tree["sample_stats"] = xr.DataTree(stats)
+    assert populations_of(tree).tolist() == [[0, 0, 0], [0, 1, 1]]
+
+
+def test_the_default_is_importance_sampling(monkeypatch):
+    chosen = []
+
+    def run(idata, model, estimators, **settings):
+        chosen.append([one.name for one in estimators])
+        return {}
+
+    monkeypatch.setattr(estimation, "run_estimators", run)
+    tree = xr.DataTree()
+    estimation.estimate_evidence(tree)
+    tree.attrs["sampler"] = BY_PARTICLES
+    estimation.estimate_evidence(tree)
+    assert chosen == [["chib_jeliazkov", "bridge"], ["importance"]]

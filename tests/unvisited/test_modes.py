@@ -1,0 +1,116 @@
+"""A mode that particles have missed is found from points on their way, and nothing else is."""
+
+import numpy as np
+import pytest
+
+from pymc_statespace_filters.smc.particles import Particles, Populations
+from pymc_statespace_filters.unvisited.modes import SIZES, Visited, joined, missed_mode
+
+R, N, SD = 10, 100, 0.08
+CENTRES, SDS, MASSES = (
+    np.array([[-4.0, 0.0], [4.0, 0.0]]),
+    np.array([1.0, SD]),
+    np.array([0.7, 0.3]),
+)
+SHIFT = 5.0  # the log of the evidence
+
+
+def log_density(x, rng=None):
+    """A wide normal distribution of mass 0.7 and a narrow one of 0.3."""
+    squares = ((x[:, None] - CENTRES) ** 2).sum(axis=-1) / SDS**2
+    parts = np.log(MASSES / (2 * np.pi * SDS**2)) - squares / 2
+    return np.logaddexp(*parts.T) + SHIFT
+
+
+def drawn(share, rng):
+    """Particles of which a share is in the narrow mode."""
+    which = (rng.random(R * N) < share).astype(int)
+    return CENTRES[which] + SDS[which, None] * rng.standard_normal((R * N, 2))
+
+
+def populations_of(x):
+    zero, none = np.zeros(len(x)), np.empty((len(x), 0))
+    return Populations.of_equal_weights(
+        Particles(x, log_density(x), zero, zero, none.astype(int), none), R
+    )
+
+
+def on_the_way(rng):
+    """Points of a normal distribution as wide as a prior, and of a tempered one."""
+    wide, near = 10 * rng.standard_normal((500, 2)), 4 * rng.standard_normal((500, 2))
+    near = np.concatenate([near, CENTRES[1] + [[0.2, 0.2], [-0.25, 0.1]]])
+    return joined(
+        [Visited(x, log_density(x), np.full(len(x), i)) for i, x in enumerate((wide, near))]
+    )
+
+
+def looked(share, seed, n_evaluations=2000, evaluate=log_density, lost=0.0):
+    rng = np.random.default_rng(seed)
+    scatter = 0.05 * rng.standard_normal(R)
+    return missed_mode(
+        populations_of(drawn(share, rng)),
+        SHIFT - lost + scatter,
+        on_the_way(rng),
+        evaluate,
+        n_evaluations,
+        rng,
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_mode_that_no_particle_has_met_is_found_with_its_mass(seed):
+    """The evidence of the particles is then that of the other mode."""
+    found = looked(0.0, seed, lost=-np.log(0.7))
+    np.testing.assert_allclose(found.centre, CENTRES[1], atol=0.05)
+    assert found.particles == 0.0
+    assert found.posterior == pytest.approx(0.3, abs=0.06)
+    assert found.errors > 5
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_mode_that_few_particles_have_met_is_found(seed):
+    found = looked(0.1, seed, n_evaluations=SIZES[-1], lost=0.25)
+    np.testing.assert_allclose(found.centre, CENTRES[1], atol=0.1)
+    assert found.particles == pytest.approx(0.1, abs=0.04)
+    assert found.posterior == pytest.approx(0.3, abs=0.06)
+
+
+def test_particles_that_are_right_lack_nothing():
+    """Of two modes, one is said to be missed with a probability below one in a hundred."""
+    assert sum(looked(0.3, seed) is not None for seed in range(40)) <= 1
+
+
+def test_a_noisy_density_is_no_mode():
+    def noisy(x, rng):
+        return log_density(x) + rng.standard_normal(len(x)) - 0.5
+
+    assert sum(looked(0.3, seed, evaluate=noisy) is not None for seed in range(10)) == 0
+    assert looked(0.0, 1, evaluate=noisy, lost=-np.log(0.7)).posterior > 0.2
+
+
+def test_it_evaluates_no_more_points_than_it_may():
+    counted = []
+
+    def evaluate(x, rng):
+        counted.append(len(x))
+        return log_density(x)
+
+    assert looked(0.0, 1, SIZES[-1] - 1, evaluate) is None
+    assert not counted
+    looked(0.0, 1, 1100, evaluate)
+    assert sum(counted) == SIZES[-1] + sum(SIZES)
+
+
+def test_particles_in_one_point_are_not_compared():
+    rng = np.random.default_rng(1)
+    one = populations_of(np.ones((R * N, 2)))
+    assert missed_mode(one, np.zeros(R), on_the_way(rng), log_density, 2000, rng) is None
+
+
+def test_a_place_without_any_density_is_none():
+    """Only visited points have a density: the model has gone, or noise has taken it."""
+
+    def nowhere(x, rng):
+        return np.full(len(x), -np.inf)
+
+    assert looked(0.0, 1, evaluate=nowhere) is None
