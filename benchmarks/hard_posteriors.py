@@ -171,13 +171,16 @@ def volatility() -> pm.Model:
     )  # fmt: skip
 
 
+SCHOOLS = np.array([28.0, 8.0, -3.0, 7.0, -1.0, 1.0, 18.0, 12.0])
+ERRORS_OF_SCHOOLS = np.array([15.0, 10.0, 16.0, 11.0, 9.0, 11.0, 10.0, 18.0])
+
+
 def eight_schools() -> pm.Model:
     """Eight schools, centred: a funnel without a system."""
     with pm.Model() as model:
         mu, tau = pm.Normal("mu", 0, 5), pm.HalfCauchy("tau", 5)
         theta = pm.Normal("theta", mu, tau, shape=8)
-        errors = np.array([15.0, 10.0, 16.0, 11.0, 9.0, 11.0, 10.0, 18.0])
-        pm.Normal("y", theta, errors, observed=[28.0, 8.0, -3.0, 7.0, -1.0, 1.0, 18.0, 12.0])
+        pm.Normal("y", theta, ERRORS_OF_SCHOOLS, observed=SCHOOLS)
     return model
 
 
