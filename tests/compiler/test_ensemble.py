@@ -34,21 +34,25 @@ def pendulum(observed_with_e):
     )
 
 
-@pytest.fixture(params=[True, False], ids=["scalars", "arrays"])
-def machine_of(request, monkeypatch):
-    if not request.param:
-        monkeypatch.setattr(lowering, "MAX_EXPRESSIONS", 0)
-    compile_system.cache_clear()
-    yield compile_system
-    compile_system.cache_clear()
+def decay():
+    return psf.StateSpaceModel(
+        transition=psf.EulerMaruyama(
+            lambda x, u, t, a: [u[0] * pt.cos(t) - a * x[0]], lambda s: [[s]], dt=0.1
+        ),
+        observation=lambda x, u, r: [r * x[0] + u[0]],
+        observation_noise=[[0.4]],
+        initial_mean=lambda a: [a],
+        initial_cov=[[0.5]],
+        inputs=["force"],
+    )
 
 
 def states():
     return np.random.default_rng(3).normal(size=(2, N))
 
 
-def test_members_move_and_are_seen_as_written(machine_of):
-    machine, rng = machine_of(pendulum(False)), np.random.default_rng(1)
+def test_members_move_and_are_seen_as_written():
+    machine, rng = compile_system(pendulum(False)), np.random.default_rng(1)
     c, Z, X = machine.prepare.function(THETA), rng.normal(size=(2, 64)), np.empty((2, N))
     a, s, r = THETA
 
@@ -76,6 +80,25 @@ def test_members_move_and_are_seen_as_written(machine_of):
     np.testing.assert_allclose(out, true, rtol=1e-12)
     machine.log_density.function(c, INPUTS, 2, 0.0, np.array([np.nan, -0.4]), X, out)
     np.testing.assert_allclose(out, stats.norm(seen[1], np.sqrt(0.3)).logpdf(-0.4), rtol=1e-12)
+
+
+def test_so_they_do_on_arrays(monkeypatch):
+    """With one state: each operation of array code takes its time to compile."""
+    monkeypatch.setattr(lowering, "MAX_EXPRESSIONS", 0)
+    machine, rng = compile_system(decay()), np.random.default_rng(1)
+    c, Z, X = machine.prepare.function(THETA), rng.normal(size=(1, 64)), np.empty((1, N))
+    a, s, r = THETA
+    machine.initialise.function(c, Z, X)
+    np.testing.assert_allclose(X, a + np.sqrt(0.5) * Z[:, :N], rtol=1e-12)
+    moved = X.copy()
+    machine.propagate.function(c, INPUTS, 1, 0.25, Z, moved)
+    expected = X + 0.1 * (INPUTS[1, 0] * np.cos(0.25) - a * X) + np.sqrt(0.1) * s * Z[:, :N]
+    np.testing.assert_allclose(moved, expected, rtol=1e-12)
+    D, out, seen = np.empty((1, N)), np.empty(N), r * X + INPUTS[2, 0]
+    machine.observe.function(c, INPUTS, 2, 0.0, Z, X, D)
+    np.testing.assert_allclose(D, seen + np.sqrt(0.4) * Z[:, :N], rtol=1e-12)
+    machine.log_density.function(c, INPUTS, 2, 0.0, np.array([0.2]), X, out)
+    np.testing.assert_allclose(out, stats.norm(seen[0], np.sqrt(0.4)).logpdf(0.2), rtol=1e-12)
 
 
 def test_general_noise_has_the_covariance_d_gamma_d():

@@ -1,4 +1,7 @@
-"""Forty states and more on arrays, the form of functions that are too large to write out."""
+"""Many states on arrays, the form of functions that are too large to write out.
+
+The limit is lowered, so that a dozen states are many.
+"""
 
 import warnings
 
@@ -13,19 +16,18 @@ from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood, LogLikelihoodGradient
 from pymc_statespace_filters.testing import kalman_log_likelihood
 
-N_STATES = 40
+N_STATES = 12
 STEPS = [0, 2, 5]
 A = 0.9 * np.eye(N_STATES) + 0.05 * np.roll(np.eye(N_STATES), 1, axis=1)
 C = np.eye(N_STATES)[::4]
-Q, R = 0.1 * np.eye(N_STATES), 0.2 * np.eye(10)
+Q, R = 0.1 * np.eye(N_STATES), 0.2 * np.eye(3)
 DECAY = 0.95
-# With forty, the product by which the start is drawn would still be written out.
 N_LORENZ = 60
 
 
 @pytest.fixture(autouse=True)
 def on_arrays(monkeypatch):
-    monkeypatch.setattr(lowering, "MAX_EXPRESSIONS", 6000)
+    monkeypatch.setattr(lowering, "MAX_EXPRESSIONS", 400)
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +45,8 @@ def chain():
 
 @pytest.fixture(scope="module")
 def record():
-    observed = np.random.default_rng(40).normal(scale=1.2, size=(len(STEPS), 10))
-    observed[1, 3] = np.nan
+    observed = np.random.default_rng(40).normal(scale=1.2, size=(len(STEPS), 3))
+    observed[1, 2] = np.nan
     return observed
 
 
@@ -70,16 +72,16 @@ def test_ekf_is_the_kalman_filter_at_every_point_of_a_batch(chain, record):
 
 
 def test_enkf_approaches_the_kalman_filter(chain, record):
-    # The Gaussian form estimates 10 means and a covariance of 10 from 2000 members: its spread over
-    # the seeds is measured, its bias is of the order of p^2 / N = 0.05.
+    # The Gaussian form estimates 3 means and a covariance of 3 from 2000 members: its spread over
+    # the seeds is measured, its bias is of the order of p^2 / N = 0.005.
     terms = psf.log_likelihood(
         chain, psf.EnKF(2000, likelihood="gaussian"), {"decay": DECAY}, record, steps=STEPS,
         seed=np.arange(12),
     )  # fmt: skip
     error = terms.sum(axis=1) - kalman(record).sum()
     standard_error = error.std(ddof=1) / np.sqrt(error.size)
-    assert abs(error.mean()) < 4 * standard_error + 0.15
-    assert standard_error < 0.2
+    assert abs(error.mean()) < 4 * standard_error + 0.02
+    assert standard_error < 0.1
 
 
 @pytest.mark.slow

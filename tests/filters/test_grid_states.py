@@ -219,7 +219,7 @@ def test_mass_that_will_explode_counts_until_it_does():
 # Half of the law in either well, and draws of it that a right implementation makes.
 SHORT_STEPS, SHORT_DATA = np.array([0, 20, 60, 80]), np.array([0.3, np.nan, -0.2, 0.5])
 SHORT_ROWS = np.array([0, 1, 19, 20, 45, 60, 80])
-N_DRAWS = 4000
+N_DRAWS = 2000
 
 
 @cache

@@ -8,7 +8,7 @@ from pymc_statespace_filters.testing import kalman_log_likelihood
 from tests.references.records import OSCILLATOR, oscillator_with_gaps
 from tests.systems import linear_system, log_likelihoods
 
-N_SEEDS = 20_000
+N_SEEDS = 8_000
 N_OBSERVATIONS = 9  # with gaps in both components, and one row wholly missing
 
 

@@ -73,7 +73,7 @@ def test_many_parameters_without_a_compiler_of_c():
         )
         with pytest.warns(UserWarning, match="Loop fusion failed"):
             model.compile_logp()
-        ModelDensity(model)  # warns of nothing, which here is an error
+        # It warns of nothing, which here is an error.
         psf.sample_dram(
             draws=4, tune=4, chains=1, progressbar=False, compute_convergence_checks=False
         )

@@ -38,11 +38,19 @@ class FixedNodes:
         self.kernel[:, self.lost] = 0.0
         self.factors = [np.ones(self.x.size) if f is None else f(self.x) for f in likelihoods]
         self.observes = [f is not None for f in likelihoods]
+        self.laws = {}
         self._forward(mean, sd, start, likelihoods[0])
 
     def _kernel(self, mean, sd):
+        """In place: as many numbers as there are pairs of nodes."""
         with np.errstate(invalid="ignore", divide="ignore"):
-            return norm.pdf(self.x[:, None], mean, sd)
+            density = np.subtract.outer(self.x, mean)
+            density /= sd
+            np.square(density, out=density)
+            density *= -0.5
+            np.exp(density, out=density)
+            density /= np.sqrt(2.0 * np.pi) * sd
+        return density
 
     def _forward(self, mean, sd, start, first):
         self.predicted_density, self.filtered_density, self.terms = [], [], []
@@ -66,6 +74,11 @@ class FixedNodes:
 
     def law(self, moment):
         """Of "predicted", "filtered" or "smoothed" states."""
+        if moment not in self.laws:
+            self.laws[moment] = self._law(moment)
+        return self.laws[moment]
+
+    def _law(self, moment):
         if moment == "predicted":
             density = np.array(self.predicted_density)
         elif moment == "filtered":
@@ -88,6 +101,7 @@ class FixedNodes:
 
     def mean_product(self, k):
         """E[x_k x_{k+1}] given the whole record."""
-        joint = self.filtered_density[k] * self.weights * self.kernel
-        joint *= (self.factors[k + 1] * self.ratios()[k + 1] * self.weights)[:, None]
-        return self.x @ joint @ self.x / joint.sum()
+        before = self.filtered_density[k] * self.weights
+        after = self.factors[k + 1] * self.ratios()[k + 1] * self.weights
+        total = after @ self.kernel @ before
+        return (after * self.x) @ self.kernel @ (before * self.x) / total
