@@ -69,20 +69,20 @@ def scored_later():
 def two_variables():
     with pair_model() as model:
         psf.StateSpace(
-            "e", FORCED, psf.EKF(), params={"a": model["a"] / 2}, steps=STEPS,
+            "e", FORCED, psf.UKF(), params={"a": model["a"] / 2}, steps=STEPS,
             observed=FORCED_DATA, inputs=FORCE, dims=("step", "force"),
         )  # fmt: skip
     return model
 
 
-def panel(score_from=0):
+def panel():
     rows = np.append(PAIR_DATA, PAIR_DATA[:3] + 0.4, axis=0)
     with pm.Model() as model:
         pm.Normal("a", 0.5, 0.2, shape=2)
         pm.HalfNormal("b", 1.0)
         psf.StateSpace(
             "d", PAIR, psf.EKF(), panel=[*"xxxxyyy"], steps=[*STEPS, *STEPS[:3]], observed=rows,
-            score_from=score_from,
+            score_from=1,
         )  # fmt: skip
     return model
 
@@ -108,14 +108,12 @@ def counts():
     return model
 
 
+# Panels and late scores are together in one, and each filter with a gradient is in one.
 MODELS = {
     "EKF": pair_model,
-    "UKF": lambda: pair_model(psf.UKF()),
-    "IPLF": lambda: pair_model(psf.IPLF()),
     "score_from": scored_later,
     "two variables": two_variables,
-    "panel": panel,
-    "panel, score_from": lambda: panel(score_from=1),
+    "panel, score_from": panel,
     "ODE with counts": ode_with_counts,
     "counts": counts,
 }

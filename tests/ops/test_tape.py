@@ -6,6 +6,7 @@ import numpy as np
 import pytensor
 import pytensor.tensor as pt
 import pytest
+from pytensor.compile.mode import Mode
 from pytensor.graph.basic import Apply
 
 import pymc_statespace_filters as psf
@@ -20,6 +21,8 @@ from tests.systems import PAIR, PAIR_DATA, STEPS
 
 THETA = np.array([0.6, 0.2])
 RECORD = (STEPS, PAIR_DATA, np.zeros((0, 0)), np.array(0.0), np.array(7))
+# The rewrites of numba's mode, and no compilation of the graph, which one test has for all.
+REWRITTEN = Mode(linker="py")
 BARS = np.array([1.0, -2.0, 0.5, 3.0])  # tells apart which term a cotangent meets
 
 
@@ -57,15 +60,17 @@ def test_value_and_gradient_are_those_of_the_operations_alone(together):
 def test_a_value_alone_has_no_tape_and_a_gradient_alone_no_value():
     theta = pt.dvector("theta")
     terms, health, gradient = value_and_gradient(theta)
-    assert operations(pytensor.function([theta], [terms, health])) == [LogLikelihood]
-    assert operations(pytensor.function([theta], gradient)) == [LogLikelihoodGradient]
+    value_alone = pytensor.function([theta], [terms, health], mode=REWRITTEN)
+    assert operations(value_alone) == [LogLikelihood]
+    gradient_alone = pytensor.function([theta], gradient, mode=REWRITTEN)
+    assert operations(gradient_alone) == [LogLikelihoodGradient]
 
 
 def test_several_gradients_read_one_tape():
     theta = pt.dvector("theta")
     terms, _ = LogLikelihood(PAIR, psf.EKF())(theta, *RECORD)
     gradients = [pt.grad(terms[j], theta) for j in (0, 3)]
-    function = pytensor.function([theta], [terms, *gradients])
+    function = pytensor.function([theta], [terms, *gradients], mode=REWRITTEN)
     assert operations(function) == [TapePullback, TapePullback, TapedLogLikelihood]
     _, first, last = function(THETA)
     alone = evaluator(LogLikelihoodGradient(PAIR, psf.EKF()))
@@ -77,7 +82,8 @@ def test_a_cotangent_may_depend_on_the_value():
     """d exp(L) = exp(L) dL: the pass back waits for the value, and both come of one tape."""
     theta = pt.dvector("theta")
     likelihood = pt.exp(LogLikelihood(PAIR, psf.EKF())(theta, *RECORD)[0].sum())
-    function = pytensor.function([theta], [likelihood, pt.grad(likelihood, theta)])
+    both = [likelihood, pt.grad(likelihood, theta)]
+    function = pytensor.function([theta], both, mode=REWRITTEN)
     assert operations(function) == [TapePullback, TapedLogLikelihood]
     value, gradient = function(THETA)
     alone = evaluator(LogLikelihoodGradient(PAIR, psf.EKF()))(THETA, *RECORD, np.ones(4))[0]
@@ -87,13 +93,14 @@ def test_a_cotangent_may_depend_on_the_value():
 def test_likelihoods_at_other_parameters_are_no_help():
     theta, other = pt.dvectors("theta", "other")
     _, _, gradient = value_and_gradient(theta)
-    function = pytensor.function([theta, other], [value_and_gradient(other)[0], gradient])
+    both = [value_and_gradient(other)[0], gradient]
+    function = pytensor.function([theta, other], both, mode=REWRITTEN)
     assert operations(function) == [LogLikelihood, LogLikelihoodGradient]
 
 
 def test_modes_without_rewrites_or_numba_agree(together):
     theta = pt.dvector("theta")
-    for mode in ("FAST_COMPILE", pytensor.compile.mode.Mode(linker="py")):
+    for mode in ("FAST_COMPILE", REWRITTEN):
         plain = pytensor.function([theta], value_and_gradient(theta), mode=mode)
         for a, b in zip(plain(THETA), together(THETA), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-13)
@@ -113,7 +120,8 @@ def test_an_empty_record_and_a_record_of_nothing_seen():
     empty = (np.array([], dtype="int64"), np.zeros((0, 2)), *RECORD[2:])
     unseen = (np.array([0, 3]), np.full((2, 2), np.nan), *RECORD[2:])
     for record in (empty, unseen):
-        function = pytensor.function([theta], value_and_gradient(theta, record=record))
+        both = value_and_gradient(theta, record=record)
+        function = pytensor.function([theta], both, mode=REWRITTEN)
         terms, _, gradient = function(THETA)
         np.testing.assert_array_equal(terms, np.zeros(len(record[0])))
         np.testing.assert_array_equal(gradient, [0.0, 0.0])
