@@ -24,6 +24,7 @@ from pymc_statespace_filters.sampling import DRAM
 from pymc_statespace_filters.sampling.output.report import left_out_warnings
 from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
 from tests.kernels import with_kernel
+from tests.modes import AS_IT_STANDS
 from tests.sampling.test_dram import assert_moments, sample, simple_model
 from tests.sampling.test_results import assert_same, rich_model
 from tests.systems import autoregression
@@ -132,6 +133,7 @@ def test_data_changed_between_runs():
 # The tree.
 
 
+@pytensor.config.change_flags(mode=AS_IT_STANDS)
 def two_trees(model, **changes):
     """By ``sample_dram`` and by ``pm.sample``, which do not draw the same numbers."""
     mine = sample_dram(model, draws=30, tune=20, **with_kernel(changes))
@@ -168,6 +170,7 @@ def test_a_tree_as_of_pm_sample_with_several_records(noisy):
 
 @pytest.mark.filterwarnings("ignore:the terms of a StateSpace variable")
 @pytest.mark.filterwarnings("ignore:log-evidence .* the chains disagree")  # short ones
+@pytensor.config.change_flags(mode=AS_IT_STANDS)
 def test_what_is_done_with_a_tree(noisy, tmp_path):
     tree = sample_dram(noisy, draws=400, tune=300)
     with noisy:
@@ -332,46 +335,52 @@ warnings.simplefilter("ignore")
 from tests.sampling.test_sample_dram import Watched, sample_dram
 watched = Watched()
 sample_dram(watched.model, draws=1, tune=1)
-watched.seconds, watched.announced = {seconds}, watched.calls + {calls}
-tree = sample_dram(watched.model, draws=10**7, tune={tune}, chains=3, discard_tuned_samples=False)
-print({{name: dict(group.sizes) for name, group in tree.children.items() if "post" in name}})
+for seconds, calls, tune in ((0.0, 100, 20), (0.6, 6, 0)):
+    watched.seconds, watched.announced = seconds, watched.calls + calls
+    tree = sample_dram(
+        watched.model, draws=10**7, tune=tune, chains=3, discard_tuned_samples=False
+    )
+    sizes = {name: dict(group.sizes) for name, group in tree.children.items() if "post" in name}
+    print(sizes, flush=True)
 """
 
 
-def interrupt(seconds, tune, presses):
+def interrupt(child, presses):
     """Output after Ctrl-C, and how long it took."""
-    script = INTERRUPTED.format(seconds=seconds, tune=tune, calls=6 if seconds else 100)
-    child = subprocess.Popen(
-        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    watchdog = threading.Timer(120.0, child.kill)  # whoever is not interrupted draws for hours
-    watchdog.start()
-    with child:
-        while child.stdout.readline() not in ("go\n", ""):
-            pass
-        time.sleep(1.0)
-        begun = time.monotonic()
-        for _ in range(presses):
-            child.send_signal(signal.SIGINT)
-            time.sleep(0.15)
-        output = child.stdout.readline() or child.stderr.read()
-    watchdog.cancel()
+    while child.stdout.readline() not in ("go\n", ""):
+        pass
+    time.sleep(1.0)
+    begun = time.monotonic()
+    for _ in range(presses):
+        child.send_signal(signal.SIGINT)
+        time.sleep(0.15)
+    output = child.stdout.readline() or child.stderr.read()
     return output, time.monotonic() - begun
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-@pytest.mark.parametrize(("seconds", "tune", "presses"), [(0.0, 20, 1), (0.6, 0, 2)])
-def test_an_interrupt_returns_what_is_there(seconds, tune, presses):
+def test_an_interrupt_returns_what_is_there():
     """Also where an evaluation takes long, a chain waits for its turn, and somebody is impatient.
 
     The limit is for a machine with other things to do.
     """
-    output, took = interrupt(seconds, tune, presses)
-    sizes = ast.literal_eval(output)
-    assert took < 8.0
-    assert sizes["posterior"]["draw"] >= 1
-    assert sizes["posterior"]["chain"] == 2
-    assert sizes.get("warmup_posterior", {"draw": 0})["draw"] == tune
+    child = subprocess.Popen(
+        [sys.executable, "-c", INTERRUPTED],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    watchdog = threading.Timer(120.0, child.kill)  # whoever is not interrupted draws for hours
+    watchdog.start()
+    with child:
+        found = [interrupt(child, presses) for presses in (1, 2)]
+    watchdog.cancel()
+    for (output, took), tune in zip(found, (20, 0), strict=True):
+        sizes = ast.literal_eval(output)
+        assert took < 8.0
+        assert sizes["posterior"]["draw"] >= 1
+        assert sizes["posterior"]["chain"] == 2
+        assert sizes.get("warmup_posterior", {"draw": 0})["draw"] == tune
 
 
 @pytest.mark.parametrize(
