@@ -61,18 +61,18 @@ def deviations(idata):
 def test_exact_posterior_from_a_noisy_likelihood(toy, stages):
     """Log-likelihood of variance 1.7; 4 standard errors, 6e-5 a comparison, two comparisons."""
     with toy(noise_sd=1.3):
-        idata = sample(DRAM(stages=stages), draws=20_000)
+        idata = sample(DRAM(stages=stages), draws=8000)
     in_mean, in_sd = deviations(idata)
     assert abs(in_mean) < 4.0
     assert abs(in_sd) < 4.0
-    assert az.mcse(idata["posterior"]["mu"].to_numpy(), method="sd") < 0.05 * exact_posterior()[1]
+    assert az.mcse(idata["posterior"]["mu"].to_numpy(), method="sd") < 0.08 * exact_posterior()[1]
 
 
 @pytest.mark.parametrize("stages", [1, (2, 2)])
 def test_the_same_test_finds_redrawn_estimates(toy, stages):
     with toy(noise_sd=1.3):
-        idata = sample(Redrawing(stages=stages), draws=20_000)
-    assert deviations(idata)[1] > 8.0
+        idata = sample(Redrawing(stages=stages), draws=8000)
+    assert deviations(idata)[1] > 6.0
 
 
 def test_the_seed_behind_each_draw_reproduces_its_estimate(toy):
@@ -90,7 +90,7 @@ def test_the_seed_behind_each_draw_reproduces_its_estimate(toy):
 
 def test_every_proposal_has_noise_of_its_own(toy):
     with toy(noise_sd=1.3):
-        stats = sample(DRAM(stages=(2, 2)), draws=2000)["sample_stats"]
+        stats = sample(DRAM(stages=(2, 2)), draws=500)["sample_stats"]
     seeds, accepted = stats["d_seed"].to_numpy(), stats["accepted"].to_numpy()
     changed = seeds[:, 1:] != seeds[:, :-1]
     np.testing.assert_array_equal(changed, accepted[:, 1:] == 1.0)
@@ -101,7 +101,7 @@ def test_held_noise_is_the_models(toy):
     """Common random numbers: one seed for all; the noise of this toy then cancels."""
     with toy(noise_sd=1.3):
         step = DRAM(refresh_noise=False)
-        idata = sample(step, draws=8000)
+        idata = sample(step, draws=4000)
         step._target._seeds["d"].set_value(np.array(21))
         again = sample(step, draws=10)
     assert np.all(idata["sample_stats"]["d_seed"] == 20)
@@ -131,7 +131,7 @@ def test_another_variables_move_keeps_the_noise(toy):
     """The prior of the other variable is re-evaluated, the estimate is not."""
     with toy(noise_sd=1.3) as model:
         other = pm.Normal("other", model["mu"], 1.0)
-        idata = sample([DRAM([model["mu"]]), pm.Metropolis([other])], draws=10_000)
+        idata = sample([DRAM([model["mu"]]), pm.Metropolis([other])], draws=4000)
     assert max(map(abs, deviations(idata))) < 4.0
     draws = idata["posterior"]["other"].to_numpy()
     mean, sd = exact_posterior()

@@ -25,7 +25,7 @@ def sample_dram(**settings):
     return psf.sample_dram(**with_kernel(settings))
 
 
-def chains(draws=20_000, tune=1000, model=None, **settings):
+def chains(draws=8000, tune=1000, model=None, **settings):
     return psf.sample_dram(
         draws,
         tune,
@@ -56,7 +56,7 @@ def test_exact_posterior(settings):
 
 def test_the_same_test_finds_held_noise():
     """One seed's error stays in the posterior: common random numbers are not exact."""
-    idata = chains(refresh_noise=False)
+    idata = chains(20_000, refresh_noise=False)
     assert max(worst_deviations(idata)) > 6.0
 
 
