@@ -6,6 +6,7 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
+import pytest
 from scipy.stats import chi2, norm
 
 import pymc_statespace_filters as psf
@@ -211,11 +212,29 @@ class Calibration(NamedTuple):
         Right errors of 200 replications are outside once in a thousand times; of 20 often, so that
         the limits are then so wide that right errors are outside as rarely.
         """
-        low, high, furthest = *SQUARES, BIAS
-        if self.n_runs < 200:
-            low, high = chi2.ppf([0.0001, 0.9999], self.n_runs) / self.n_runs
-            furthest = norm.isf(0.0002) / self.n_runs**0.5
-        return low <= self.mean_square <= high and abs(self.mean_z) <= furthest
+        return _are_of_normals(self.n_runs, self.mean_z, self.mean_square)
+
+
+def _are_of_normals(n, mean, mean_square):
+    """Whether n scores may be standard normal: those that are fail once in a thousand times."""
+    low, high, furthest = *SQUARES, BIAS
+    if n < 200:
+        low, high = chi2.ppf([0.0001, 0.9999], n) / n
+        furthest = norm.isf(0.0002) / n**0.5
+    return low <= mean_square <= high and abs(mean) <= furthest
+
+
+def check_scores(z):
+    """Fail unless errors, divided by their standard errors, may be standard normal."""
+    mean, mean_square = np.mean(z), np.mean(np.square(z))
+    assert _are_of_normals(len(z), mean, mean_square), (mean, mean_square)
+
+
+# Of 50 scores the mean is to be within 0.5 of zero and the mean square within [0.42, 1.92]: errors
+# that are reported half or twice as large as they are, are found but for twice in a thousand times.
+EACH_NUMBER_OF_RUNS = pytest.mark.parametrize(
+    "n_runs", [50, pytest.param(200, marks=pytest.mark.slow)]
+)
 
 
 def calibrate(estimator, source, n_runs):

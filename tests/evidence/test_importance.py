@@ -9,6 +9,7 @@ from pymc_statespace_filters.errors import DataMismatchError
 from pymc_statespace_filters.evidence.estimators.importance import Importance
 from pymc_statespace_filters.importance import pareto_k
 from tests.evidence.analytic import gaussian, half_normal
+from tests.evidence.calibration import EACH_NUMBER_OF_RUNS, check_scores
 from tests.evidence.hard_targets import Funnel
 from tests.evidence.targets import Banana, Regression, TwoModes, bounded, half_normally_distributed
 
@@ -47,8 +48,7 @@ def test_proposals_without_density_count_as_zeros():
     assert found.settings["zero_density"] > 0.01
 
 
-# For 200 independent standard normal scores the mean is within 0.25 of zero and the mean square
-# within [0.7, 1.4] with probability above 0.9995; seeds are fixed.
+@EACH_NUMBER_OF_RUNS
 @pytest.mark.parametrize(
     ("make", "n_draws", "correlation", "noise_sd"),
     [
@@ -59,15 +59,14 @@ def test_proposals_without_density_count_as_zeros():
         pytest.param(lambda: Banana(4), 500, 0.0, 0.0, marks=pytest.mark.slow),
     ],
 )  # fmt: skip
-def test_standard_errors_are_calibrated(make, n_draws, correlation, noise_sd):
+def test_standard_errors_are_calibrated(make, n_draws, correlation, noise_sd, n_runs):
     target, scores = make(), []
-    for run in range(200):
+    for run in range(n_runs):
         rng = np.random.default_rng([54, run])
         posterior = target.posterior((4, n_draws), rng, correlation=correlation, noise_sd=noise_sd)
         found = Importance().estimate(posterior, rng=rng)
         scores.append((found.log_evidence - target.log_evidence) / found.se)
-    assert abs(np.mean(scores)) < 0.25
-    assert 0.7 < np.mean(np.square(scores)) < 1.4
+    check_scores(scores)
 
 
 def test_a_noisy_likelihood_gives_the_evidence_of_its_expectation():
