@@ -73,10 +73,10 @@ def test_the_suggestion_is_in_the_target_at_the_exact_mode(first):
 
 def test_a_panel_is_tuned_on_its_noisiest_record_unless_parameters_are_shared():
     """Six like records; the last has no observation but one, and hardly any noise."""
-    n, rows = 6, np.tile(STEPS[:20], 6)
-    labels = np.repeat(np.arange(n), 20)
-    observed = np.tile(DATA[:20], n)
-    observed[-19:] = np.nan
+    n, rows = 6, np.tile(STEPS[:10], 6)
+    labels = np.repeat(np.arange(n), 10)
+    observed = np.tile(DATA[:10], n)
+    observed[-9:] = np.nan
     found = {}
     for name in ("own", "shared"):
         with pm.Model() as model:
@@ -315,11 +315,12 @@ def test_estimates_that_are_off_whatever_their_variance_are_doubted(monkeypatch)
     """The sensor loses the sign, which an ensemble of normal members does not."""
     monkeypatch.setattr(particle_budget, "search", lambda measure, first, target: [measure(60)])
     squared = autoregression(spread=1.0, observation=lambda x: [x[0] ** 2])
-    observed = simulated(STEPS, 5, phi=0.9, spread=1.0, observation_noise=0.0) ** 2
+    steps = STEPS[:30]
+    observed = simulated(steps, 5, phi=0.9, spread=1.0, observation_noise=0.0) ** 2
     with pm.Model() as model:
         pm.Uniform("phi")
         params = {"observation_noise": 0.1}
-        settings = {"steps": STEPS, "observed": observed, "params": params}
+        settings = {"steps": steps, "observed": observed, "params": params}
         psf.StateSpace("d", squared, psf.EnKF(60), **settings)
     with pytest.warns(FilterWarning, match=r"d: .*EnKF\(\d+\) is .* nats .*Use ") as caught:
         psf.suggest_particles(model, random_seed=1, progressbar=False)
@@ -349,8 +350,19 @@ def test_ensemble_filters_are_tuned_too():
             assert np.isfinite(table["variance_centre"]).all()
 
 
+def short_run_by(sample):
+    """The sampler with fewer draws than it is asked for."""
+
+    def short_run(*draws, tune=50, **settings):
+        return sample(100, tune=100, **settings)
+
+    return short_run
+
+
 def test_the_pages_on_sampling_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # one writes a checkpoint
+    for module, name in ((psf, "sample"), (psf, "sample_dram"), (pm, "sample")):
+        monkeypatch.setattr(module, name, short_run_by(getattr(module, name)))
     with pytensor.config.change_flags(mode="NUMBA"):
         names = run_code_of("docs/howto/sampling.md", "docs/explanation/noisy-likelihoods.md")
     table = names["table"]

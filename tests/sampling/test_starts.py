@@ -5,6 +5,7 @@ from collections import Counter
 import arviz as az
 import numpy as np
 import pymc as pm
+import pytensor
 import pytensor.tensor as pt
 import pytest
 from scipy.stats import kstest, norm
@@ -17,6 +18,7 @@ from pymc_statespace_filters.pymc_model.graph_rewrites import expensive_variable
 from pymc_statespace_filters.sampling.starts.population import population_of
 from pymc_statespace_filters.sampling.target.log_density import LogDensity
 from pymc_statespace_filters.sampling.target.target import Target
+from tests.modes import AS_IT_STANDS
 from tests.systems import autoregression, simulated
 
 
@@ -39,15 +41,15 @@ def test_are_distributed_as_a_narrow_posterior():
 
 
 def test_are_in_both_modes_in_proportion_to_their_mass():
-    """Over ten seeds the share of the smaller mode is 0.3 with a standard deviation of 0.02."""
+    """Over three seeds the share of the smaller mode is 0.3 with a standard deviation of 0.04."""
     with pm.Model() as model:
         x = pm.Normal("x", 0.0, 10.0)
         modes = [pt.log(w) + pm.logp(pm.Normal.dist(m, 0.05), x) for w, m in ((0.7, -4), (0.3, 4))]
         pm.Potential("likelihood", pt.logaddexp(*modes))
     shares = [
-        np.mean([start["x"] > 0 for start in starts_of(model, 256, seed)]) for seed in range(10)
+        np.mean([start["x"] > 0 for start in starts_of(model, 256, seed)]) for seed in range(3)
     ]
-    assert np.mean(shares) == pytest.approx(0.3, abs=0.07)
+    assert np.mean(shares) == pytest.approx(0.3, abs=0.12)
     assert min(shares) > 0.05
 
 
@@ -62,17 +64,20 @@ def test_find_the_frequency_of_an_oscillation():
         phase = pm.Normal("phase", 0.0, 1.0)
         sigma = pm.HalfNormal("sigma", 1.0)
         pm.Normal("y", amplitude * pt.sin(frequency * t + phase), sigma, observed=seen)
-    for seed in (1, 2, 3):
+    log_density = model.compile_logp(mode=AS_IT_STANDS)
+    for seed in (1, 2):
         for start in starts_of(model, seed=seed):
             assert start["frequency"] == pytest.approx(2.3, abs=0.003)
             assert start["sigma"] == pytest.approx(0.05, abs=0.01)
-            assert np.isfinite(model.compile_logp()(_transformed(model, start)))
+            assert np.isfinite(log_density(_transformed(model, start)))
 
 
 def _transformed(model, start):
     return model.initial_point() | {
         model.rvs_to_values[rv].name: np.asarray(
-            start[rv.name] if transform is None else transform.forward(start[rv.name]).eval()
+            start[rv.name]
+            if transform is None
+            else transform.forward(start[rv.name]).eval(mode=AS_IT_STANDS)
         )
         for rv, transform in model.rvs_to_transforms.items()
         if rv in model.free_RVs
@@ -91,23 +96,23 @@ def test_are_initial_values_of_both_samplers():
             assert 0.0 < start["below"] < start["scale"]
         settings = {"chains": 2, "initvals": starts, "random_seed": 1, "progressbar": False}
         settings |= {"draws": 4, "tune": 0, "compute_convergence_checks": False}
-        chains = psf.sample_dram(
-            kernel=psf.RandomWalkSettings(stages=1, proposal_cov=1e-20 * np.eye(4)), **settings
-        )
+        still = psf.RandomWalkSettings(stages=1, proposal_cov=1e-20 * np.eye(4))
+        with pytensor.config.change_flags(mode=AS_IT_STANDS):
+            chains = psf.sample_dram(kernel=still, **settings)
+            pm.sample(step=pm.Metropolis(), cores=1, **settings)
         for chain, start in enumerate(starts):
             for name, value in start.items():
                 first = chains["posterior"][name].isel(chain=chain, draw=0)
                 assert first.values == pytest.approx(value, rel=1e-6)
-        pm.sample(step=pm.Metropolis(), cores=1, **settings)
 
 
 def test_noisy_likelihoods_and_seeds():
     with pm.Model() as model:
         params = {"phi": pm.Uniform("phi", 0.0, 1.0), "spread": pm.HalfNormal("spread", 1.0)}
-        steps = np.arange(1, 31)
+        steps = np.arange(1, 11)
         observed = simulated(steps, 1, 0.8, 0.5)
         psf.StateSpace(
-            "d", autoregression(), psf.BootstrapPF(50), params=params, steps=steps,
+            "d", autoregression(), psf.BootstrapPF(20), params=params, steps=steps,
             observed=observed,
         )  # fmt: skip
     (first,), (again,), (other,) = (starts_of(model, 1, seed) for seed in (1, 1, 2))
