@@ -147,18 +147,30 @@ def _blocks_by_variable(density: SubmodelDensity) -> Iterator[tuple[str, Columns
 def _check_distinct(
     density: SubmodelDensity, draws: Array, uses: Uses, rng: np.random.Generator
 ) -> None:
-    """Raise if two candidates have no effect alone, and one together."""
+    """Raise if two candidates have an effect together, but neither has one without the other.
+
+    The square of a state that nothing has moved has no effect either, but all terms move it.
+    """
     n = len(density.candidates)
     own = _own_blocks(density)
     idle = [j for j in range(n) if not uses.by_one[j, own[j]].any()]
     pairs = [(a, b) for a in idle for b in idle if a < b]
     if not pairs:
         return
-    sets = np.zeros((len(pairs), n), dtype=bool)
-    for row, pair in zip(sets, pairs, strict=True):
+    both = np.zeros((len(pairs), n), dtype=bool)
+    for row, pair in zip(both, pairs, strict=True):
         row[list(pair)] = True
-    for (a, b), matters in zip(pairs, _matters(density, draws, sets, rng), strict=True):
-        if matters[own[a]].any() and matters[own[b]].any():
+    together = _matters(density, draws, both, rng)
+    pairs = [
+        (a, b)
+        for (a, b), matters in zip(pairs, together, strict=True)
+        if matters[own[a]].any() and matters[own[b]].any()
+    ]
+    if not pairs:
+        return
+    without = _matters(density, draws, ~np.eye(n, dtype=bool), rng)
+    for a, b in pairs:
+        if not (without[b, own[a]].any() or without[a, own[b]].any()):
             first, second = (density.candidates.keys[i] for i in (a, b))
             raise ModelError(
                 f"absent must have one candidate for a term: {first!r} and {second!r} switch off "

@@ -255,6 +255,31 @@ def test_two_candidates_of_one_term_are_named():
         )
 
 
+def test_candidates_that_act_through_several_others_are_not_one_term():
+    """As the square of a state that only other terms move: y = a (b + c), by quadrature."""
+    y = np.array([1.0, 2.0, 1.5])
+    with pm.Model() as model:
+        a, b, c = (pm.Normal(name, 0, 1) for name in "abc")
+        pm.Normal("y", a * (b + c), 1.0, observed=y)
+    rng = np.random.default_rng(1)
+    x = rng.standard_normal((3, 100_000))
+    x = x[:, rng.random(100_000) < np.exp(-1.5 * (x[0] * (x[1] + x[2]) - 1.5) ** 2)][:, :2000]
+    draws = draws_of_values({name: v.reshape(2, -1) for name, v in zip("abc", x, strict=True)})
+    terms = psf.select_terms(
+        model, dict.fromkeys("abc", 0.0), idata=draws, inclusion=0.5, random_seed=1,
+        progressbar=False,
+    )["terms"]  # fmt: skip
+    # By the law of the mean of y, given the product of a normal and one with variance 0, 1 or 2.
+    nodes, w = np.polynomial.hermite_e.hermegauss(80)
+    squares = np.multiply.outer(np.multiply.outer([0.0, 1.0, 2.0], nodes**2), nodes**2)
+    signs = np.sign(np.multiply.outer(nodes, nodes))
+    of = np.exp(-1.5 * (signs * squares**0.5 - 1.5) ** 2) @ w @ w / w.sum() ** 2
+    total = 5 * of[0] + 2 * of[1] + of[2]
+    exact = np.array([of[0] + 2 * of[1] + of[2], *[2 * of[0] + of[1] + of[2]] * 2]) / total
+    assert (terms["inclusion_se"] < 0.02).all()
+    np.testing.assert_array_less(abs(terms["inclusion"] - exact), 4 * terms["inclusion_se"] + 1e-9)
+
+
 def test_a_likelihood_that_is_not_finite_is_named():
     with pm.Model() as model:
         mu, sd = pm.Normal("mu", 0, 1), pm.Normal("sd", 1, 0.2)
