@@ -30,26 +30,45 @@ def with_priors(
     return model
 
 
-def predator_prey() -> pm.Model:
-    """Predator and prey in logarithms, with saturation: 11 parameters, 97 rows of both."""
+def _predator_prey_drift(x, r, K, a, h, gain, m):
+    prey, predator = pt.exp(x[0]), pt.exp(x[1])
+    eaten = a / (1.0 + a * h * prey)
+    return [r * (1.0 - prey / K) - eaten * predator, gain * eaten * prey - m]
 
-    def drift(x, r, K, a, h, gain, m):
-        prey, predator = pt.exp(x[0]), pt.exp(x[1])
-        eaten = a / (1.0 + a * h * prey)
-        return [r * (1.0 - prey / K) - eaten * predator, gain * eaten * prey - m]
 
+def _predator_prey(seen: dict[str, float], filter=None, **sensor) -> pm.Model:
+    """In logarithms, with saturation; 97 rows of both."""
     system = psf.StateSpaceModel(
-        transition=psf.EulerMaruyama(drift, lambda s1, s2: [[s1, 0.0], [0.0, s2]], dt=0.1),
-        observation=lambda x: [x[0], x[1]],
-        observation_noise=lambda sensor: sensor**2 * np.eye(2),
+        transition=psf.EulerMaruyama(
+            _predator_prey_drift, lambda s1, s2: [[s1, 0.0], [0.0, s2]], dt=0.1
+        ),
         initial_mean=lambda x0, y0: [pt.log(x0), pt.log(y0)],
         initial_cov=1e-4 * np.eye(2),
+        **sensor,
     )
     truth = {
         "r": 1.0, "K": 5.0, "a": 1.5, "h": 0.5, "gain": 0.6, "m": 0.6, "s1": 0.1, "s2": 0.1,
-        "sensor": 0.1, "x0": 2.0, "y0": 1.0,
-    }  # fmt: skip
-    return with_priors(system, truth, np.arange(0, 97 * 5, 5))
+        "x0": 2.0, "y0": 1.0,
+    } | seen  # fmt: skip
+    return with_priors(system, truth, np.arange(0, 97 * 5, 5), filter=filter)
+
+
+def predator_prey() -> pm.Model:
+    """Predator and prey, both measured: 11 parameters."""
+    return _predator_prey(
+        {"sensor": 0.1},
+        observation=lambda x: [x[0], x[1]],
+        observation_noise=lambda sensor: sensor**2 * np.eye(2),
+    )
+
+
+def predator_prey_counts() -> pm.Model:
+    """Predator and prey, both counted: 11 parameters, by `BootstrapPF`."""
+    return _predator_prey(
+        {"seen": 20.0},
+        psf.BootstrapPF(200),
+        observation_dist=lambda x, seen: [pm.Poisson.dist(seen * pt.exp(x[i])) for i in range(2)],
+    )
 
 
 def library() -> pm.Model:
@@ -186,6 +205,7 @@ def eight_schools() -> pm.Model:
 
 HARD: dict[str, Callable[[], pm.Model]] = {
     "predator and prey, 11": predator_prey,
+    "counts of predator and prey, 11": predator_prey_counts,
     "library, 22": library,
     "VAR(1), 15": vector_autoregression,
     "glucose, 5": glucose,
