@@ -16,7 +16,7 @@ from scipy import linalg, stats
 
 import pymc_statespace_filters as psf
 
-N_SEEDS = 20_000
+N_SEEDS = 10_000
 RECORD = {"observed": np.array([3.0, 1.0, 2.0, 4.0]), "steps": np.array([0, 1, 3, 4])}
 
 

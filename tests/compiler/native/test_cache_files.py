@@ -64,13 +64,13 @@ def test_a_module_is_used_where_no_file_can_be_written(tmp_path, monkeypatch):
     assert kept("b", lambda: b"code") == b"code"
 
 
-SUM = """
+GRAPH = """
 import sys
 import numba, pytensor, pytensor.tensor as pt
 from pymc_statespace_filters.pymc_model.density import compile_density
 
 x = pt.dvector()
-graph = pt.sum(pt.exp(x))
+graph = pt.exp(x[0] + x[1])
 if sys.argv[1] == "damaged":
     try:
         pytensor.function([x], graph, mode="NUMBA")([0.0, 0.0])
@@ -80,9 +80,9 @@ print(compile_density([x], [graph])([0.0, 0.0])[0])
 """
 
 
-def _run_sum(folder, files):
+def _run_graph(folder, files):
     flags = {"PYTENSOR_FLAGS": f"base_compiledir={folder.as_posix()},blas__ldflags=,cxx="}
-    command = [sys.executable, "-c", SUM, files]
+    command = [sys.executable, "-c", GRAPH, files]
     run = subprocess.run(
         command, env=os.environ | flags, capture_output=True, text=True, timeout=LIMIT
     )
@@ -92,7 +92,7 @@ def _run_sum(folder, files):
 def test_damaged_files_of_pytensor_are_compiled_anew_in_a_density(tmp_path):
     whole = tmp_path / "whole"
     whole.mkdir()
-    assert _run_sum(whole, "whole") == "2.0\n"
+    assert _run_graph(whole, "whole") == "1.0\n"
     for ending in ("nbi", "nbc"):
         folder = tmp_path / ending
         shutil.copytree(whole, folder)
@@ -100,7 +100,7 @@ def test_damaged_files_of_pytensor_are_compiled_anew_in_a_density(tmp_path):
         assert files
         for file in files:
             file.write_bytes(file.read_bytes()[:10])
-        assert _run_sum(folder, "damaged") == "PyTensor's own affair\n2.0\n"
+        assert _run_graph(folder, "damaged") == "PyTensor's own affair\n1.0\n"
         assert all(file.stat().st_size > 10 for file in files)  # for the next process
 
 
