@@ -420,13 +420,13 @@ def test_chains_over_sub_models_agree_with_all_of_them(monkeypatch):
     assert (np.abs(terms["inclusion"] - truth) < 4 * error + 1e-3).all()
 
 
-def poor_draws(centre, width):
-    """Normal draws of four coefficients, of which the last one is positive, for `few_terms`."""
-    b = centre + width * np.random.default_rng(7).standard_normal((4, 2, 300))
-    return draws_of_values({f"b{i}": one for i, one in enumerate([*b[:3], abs(b[3])])})
+def poor_draws(centre, width, n_terms=4):
+    """Normal draws of coefficients, of which the last one is positive."""
+    b = centre + width * np.random.default_rng(7).standard_normal((n_terms, 2, 300))
+    return draws_of_values({f"b{i}": one for i, one in enumerate([*b[:-1], abs(b[-1])])})
 
 
-@pytest.mark.parametrize(("centre", "width"), [(0.0, 3.0), (2.0, 0.1), (0.5, 0.01)])
+@pytest.mark.parametrize(("centre", "width"), [(0.0, 3.0), (2.0, 0.1)])
 def test_draws_of_another_law_change_no_result(centre, width):
     regression = few_terms()
     model = regression.model(as_system=False)
@@ -437,10 +437,10 @@ def test_draws_of_another_law_change_no_result(centre, width):
 
 
 def test_draws_from_which_nothing_is_found_are_doubted():
-    regression = few_terms()
+    regression = Regression(3, n_terms=2, n=20)
     model = regression.model(as_system=False)
     with pytest.warns(EvidenceWarning, match="draws of idata do not seem to be from the posterior"):
-        selected(regression, model, idata=poor_draws(500.0, 0.1))
+        selected(regression, model, idata=poor_draws(500.0, 0.1, n_terms=2))
 
 
 def test_chains_with_draws_of_another_law(monkeypatch):
