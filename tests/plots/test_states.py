@@ -101,6 +101,19 @@ def test_a_regime_has_ribbons_as_thick_as_its_probability():
         assert "band_90" not in alone.viz.children
 
 
+def test_the_ticks_of_a_regime_are_its_values():
+    """The middle of the ribbons of 100 times, without rounding: zero is not 1e-17."""
+    regime = np.random.default_rng(1).integers(0, 2, (2, 50, 100, 1)).astype(float)
+    group = xr.Dataset(
+        {"d_states": (("chain", "draw", "d_time", "state"), regime)},
+        coords={"d_time": np.arange(100.0), "state": ["regime"]},
+    )
+    collection = plot_states(xr.DataTree.from_dict({"smoothed_states": group}), backend="none")
+    panel = collection.viz["plot"].item(0)
+    (ticks,) = (thing for thing in panel if thing["function"] == "yticks")
+    assert ticks["labels"] == ["0", "1"]
+
+
 def test_draws_are_paths_if_smoothed_and_points_if_filtered(states):
     paths = drawn(plot_states(states, n_draws=3, backend="none"), "draws")["speed"]
     assert paths["function"] == "line"
