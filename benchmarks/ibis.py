@@ -7,8 +7,8 @@ spread over seeds, times CPU seconds, after compilation, on one core. Run it wit
 ``python -m benchmarks.ibis 20`` from the root of the repository, for 20 seeds; with
 ``particles 5`` in an environment with that library and no other for its SMC^2.
 
-With 3 seeds, on a core shared with other work: by hand sd .120 in 1.09 CPU s, tempered .019 in
-2.01, sequential .164 in 3.28; `pm.sample_smc`, with a tenth of the particles, .028 in .88 (2
+With 3 seeds, on a core shared with other work: by hand sd .120 in .94 CPU s, tempered .019 in
+2.01, sequential .164 in 2.52; `pm.sample_smc`, with a tenth of the particles, .028 in .88 (2
 seeds). Sequential with `BootstrapPF(100)` and 100 draws: 10 CPU s; particles, with 1000, had not
 ended after 200 s of wall clock on a share of a core.
 """

@@ -18,8 +18,8 @@ too small; therefore only a :math:`p_A` that is too large says anything, and the
 truncated. The same comparison is made at the narrowest component of the mixture, which particles
 have met, but perhaps too few.
 
-On the targets of `benchmarks.smc`, with 200 draws, this marks 6 of 7 runs that have lost a needle,
-and 1 of 57 runs that are right.
+On the targets of `benchmarks.smc`, with 200 draws, this marks 10 of 14 runs that have lost a
+needle, and 2 of 113 runs whose masses are within 3 errors.
 """
 
 import math
