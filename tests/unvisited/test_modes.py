@@ -2,9 +2,16 @@
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from pymc_statespace_filters.smc.particles import Particles, Populations
-from pymc_statespace_filters.unvisited.modes import SIZES, Visited, joined, missed_mode
+from pymc_statespace_filters.unvisited.modes import (
+    SIZES,
+    Visited,
+    _integrated,
+    joined,
+    missed_mode,
+)
 
 R, N, SD = 10, 100, 0.08
 CENTRES, SDS, MASSES = (
@@ -78,6 +85,38 @@ def test_a_mode_that_few_particles_have_met_is_found(seed):
 def test_particles_that_are_right_lack_nothing():
     """Of two modes, one is said to be missed with a probability below one in a hundred."""
     assert sum(looked(0.3, seed) is not None for seed in range(40)) <= 1
+
+
+def test_populations_that_differ_widely_have_wide_errors():
+    """One of ten is in the narrow mode, the others are not; then each has a tenth there."""
+    rng = np.random.default_rng(1)
+    x = np.concatenate([drawn(float(i == 0), rng)[:N] for i in range(R)])
+    args = np.full(R, SHIFT), on_the_way(rng), log_density, 2000, rng
+    assert missed_mode(populations_of(x), *args) is None
+    alike = populations_of(np.random.default_rng(2).permutation(x))
+    assert missed_mode(alike, *args).posterior > 0.2
+
+
+def test_evidences_that_differ_widely_have_wide_errors():
+    """They say too little of the wide mode, within their errors."""
+    rng = np.random.default_rng(1)
+    log_evidences = SHIFT - 0.5 + np.where(np.arange(R) % 2, 0.7, -2.0)
+    args = on_the_way(rng), log_density, SIZES[-1], rng
+    assert missed_mode(populations_of(drawn(0.3, rng)), log_evidences, *args) is None
+
+
+def test_an_integral_is_that_over_the_ellipsoid():
+    """Of a normal density over an interval; 200 points know it to 6 %."""
+
+    def normal(x, rng):
+        return norm.logpdf(x[:, 0])
+
+    place = _integrated(np.zeros(1), np.full((1, 1), 0.3), normal, np.random.default_rng(1))
+    end = 0.3 * (1 + 3 * 2**0.5 + 4) ** 0.5
+    assert place.holds(np.array([[0.99 * end], [1.01 * end]])).tolist() == [True, False]
+    exact = norm.cdf(end) - norm.cdf(-end)
+    assert np.exp(place.log_integral) == pytest.approx(exact, abs=4 * place.error * exact)
+    assert 4 * place.error * exact < 1 - exact
 
 
 def test_a_noisy_density_is_no_mode():
