@@ -89,7 +89,10 @@ def _draw_in_numba(op: StateSpaceRV, node: Any) -> tuple:
             own, steps, _, pushes = single_record(
                 theta, rows, observations, forces, record, first, last
             )
-            _, observations[first:last] = simulate(rng, own, steps, pushes, t0)
+            _, drawn = simulate(rng, own, steps, pushes, t0)
+            for i in range(last - first):  # assigning them as a slice takes a second to compile
+                for a in range(p):
+                    observations[first + i, a] = drawn[i, a]
             first = last
         return observations
 

@@ -50,6 +50,20 @@ def make_functions(compiled: Callable) -> LinearStepFunctions:
                     out[i, j] += factor * a[i, k] * b[k, j]
 
     @compiled
+    def increase(out, a):
+        """out += a; numba takes seconds to compile it for arrays of any shapes."""
+        for i in range(a.shape[0]):
+            for j in range(a.shape[1]):
+                out[i, j] += a[i, j]
+
+    @compiled
+    def copy_into(out, a):
+        """out = a, as fast."""
+        for i in range(a.shape[0]):
+            for j in range(a.shape[1]):
+                out[i, j] = a[i, j]
+
+    @compiled
     def add_left(a, b, factor, out):
         """out += factor a' b."""
         for k in range(a.shape[0]):
@@ -118,9 +132,9 @@ def make_functions(compiled: Callable) -> LinearStepFunctions:
         half = np.zeros(phi.shape)
         add(phi, phi, 1.0, phi_after)
         add(phi, q, 1.0, half)
-        q_after += q
+        increase(q_after, q)
         add_right(half, phi, 1.0, q_after)
-        c_after += c
+        increase(c_after, c)
         add(phi, c, 1.0, c_after)
 
     @compiled
@@ -132,7 +146,7 @@ def make_functions(compiled: Callable) -> LinearStepFunctions:
         add(q_bar, phi, 1.0, half)
         add(half, q, 2.0, before)
         add_right(c_bar, c, 1.0, before)
-        phi_bar[:] = before
+        copy_into(phi_bar, before)
         add_left(phi, half, 1.0, q_bar)
         copy = c_bar.copy()
         add_left(phi, copy, 1.0, c_bar)
@@ -152,8 +166,8 @@ def make_functions(compiled: Callable) -> LinearStepFunctions:
             add(spread_bar, a, 1.0 / (m + 1), spread_before)
             add_left(a, shift_bar, 1.0 / (m + 1), shift_before)
             power_bar, spread_bar, shift_bar = power_before, spread_before, shift_before
-        q_bar[:] = spread_bar
-        c_bar[:] = shift_bar
+        copy_into(q_bar, spread_bar)
+        copy_into(c_bar, shift_bar)
 
     @compiled
     def run(given, n, k, a, powers, spreads, shifts, phi, q, c):
@@ -161,9 +175,9 @@ def make_functions(compiled: Callable) -> LinearStepFunctions:
         read(given, n, 0.5**k, a, spreads[0], shifts[0])
         series(a, powers, spreads, shifts)
         for m in range(N_TERMS - 1, -1, -1):
-            phi[0] += powers[m]
-            q[0] += spreads[m]
-            c[0] += shifts[m]
+            increase(phi[0], powers[m])
+            increase(q[0], spreads[m])
+            increase(c[0], shifts[m])
         for j in range(k):
             double(phi[j], q[j], c[j], phi[j + 1], q[j + 1], c[j + 1])
 

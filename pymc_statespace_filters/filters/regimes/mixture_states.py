@@ -3,6 +3,7 @@
 Smoothed states are those of paths drawn back, see `backward_simulation`.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -142,7 +143,8 @@ def _stored(tape, table, given, n):
         w, X = _parts(tape[places[k]], n, given.n_finite, given.regimes)
         for i in range(X.shape[0]):
             copy_into(stored[k, i], X[i])
-        copy_into(stored[k, -1], np.log(w))
+        for r in range(w.size):
+            stored[k, -1, r] = math.log(w[r])
     return stored
 
 
