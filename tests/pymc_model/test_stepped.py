@@ -9,6 +9,8 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.jumps import stepped_parameters
 from pymc_statespace_filters.pymc_model.stepped import stepped_variables
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 STEPS = np.arange(1, 21)
 
 
