@@ -17,7 +17,7 @@ from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_dra
 from pymc_statespace_filters.smc.merging import merged_log_evidence
 from pymc_statespace_filters.smc.particles import Populations
 from tests.parameter_particles.autoregression import DATA, STEPS, exact, exact_transforms, model
-from tests.systems import FORCED, FREE, pair
+from tests.systems import FORCED, FREE, counts, pair
 
 SETTINGS = {"data": "sequential", "random_seed": 2, "progressbar": False}
 
@@ -69,19 +69,12 @@ def test_transforms_are_exact(by_filter, filter):
 @pytest.mark.filterwarnings("ignore:the log-evidence")  # few particles
 def test_transforms_of_counts_are_uniform():
     """Parameters from the prior, data from the model: Kolmogorov's test, wrong once in 1000."""
-    system = psf.StateSpaceModel(
-        transition=lambda x, q, a: [a * x[0] + 0.5 * q[0]],
-        process_noise=[[1.0]],
-        observation_dist=lambda x: [pm.Poisson.dist(pm.math.exp(0.5 + x[0]))],
-        initial_mean=[0.0],
-        initial_cov=[[0.5]],
-    )
-    steps, pits = np.arange(1, 51), []
+    system, steps, pits = counts(level=0.5, noise_var=0.25), np.arange(1, 26), []
     for seed, a in enumerate(np.random.default_rng(5).uniform(size=4)):
-        counts = psf.simulate(system, {"a": a}, steps=steps, random_seed=seed)["observations"]
+        observed = psf.simulate(system, {"a": a}, steps=steps, random_seed=seed)["observations"]
         with pm.Model() as built:
             pm.Uniform("a")
-            psf.StateSpace("d", system, psf.BootstrapPF(20), steps=steps, observed=counts)
+            psf.StateSpace("d", system, psf.BootstrapPF(20), steps=steps, observed=observed)
         found = psf.sample_smc(
             40, model=built, data="sequential", populations=2, random_seed=seed, progressbar=False
         )
