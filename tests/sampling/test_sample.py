@@ -60,9 +60,9 @@ def every_iteration():
     return psf.sample_dram(204, tune=100, model=simple_model(), chains=2, **QUIET)
 
 
-@pytest.mark.parametrize("draws", [51, 50])
-def test_a_draw_is_the_last_of_k_iterations(every_iteration, draws):
+def test_a_draw_is_the_last_of_k_iterations(every_iteration):
     """Whether k was given, or found by doubling; an odd number of draws leaves half a row."""
+    draws = 51
     call = {"model": simple_model(), "chains": 2, "tune": 100, **QUIET}
     thinned = psf.sample_dram(draws, thin=4, **call)
     doubled = sample(draws, until_ess=2 * draws, max_draws=4 * draws + 1, **call)
@@ -333,7 +333,7 @@ def test_a_filter_and_its_evidence_after_nuts():
     """The law of a linear model, and the same kind of result as of the walk."""
     model = state_space_model(psf.EKF())
     found = {
-        name: sample(500, tune=500, model=model, sampler=name, **QUIET) for name in ("nuts", "dram")
+        name: sample(300, tune=300, model=model, sampler=name, **QUIET) for name in ("nuts", "dram")
     }
     for name, tree in found.items():
         assert tree.attrs["sampler"] == name
@@ -342,8 +342,8 @@ def test_a_filter_and_its_evidence_after_nuts():
     both = [tree["posterior"] for tree in found.values()]
     for name in both[0].data_vars:
         means = [of[name].mean() for of in both]
-        # 400 effective draws each: four errors of the difference.
-        assert abs(means[0] - means[1]) < 4 * both[1][name].std() * np.sqrt(2 / 400)
+        # 240 effective draws each: four errors of the difference.
+        assert abs(means[0] - means[1]) < 4 * both[1][name].std() * np.sqrt(2 / 240)
     evidence = [
         psf.estimate_evidence(tree, model, estimators=("bridge",), random_seed=1)["bridge"]
         for tree in found.values()
@@ -352,5 +352,5 @@ def test_a_filter_and_its_evidence_after_nuts():
     assert abs(difference) < 4 * np.hypot(*(one.se for one in evidence))
     groups = [set(tree.children) for tree in (found["nuts"], found["dram"])]
     assert groups[1] - groups[0] == {"sampler_state"}
-    again = sample(500, tune=500, model=model, sampler="nuts", **QUIET)
+    again = sample(300, tune=300, model=model, sampler="nuts", **QUIET)
     xr.testing.assert_equal(again["posterior"].to_dataset(), both[0].to_dataset())
