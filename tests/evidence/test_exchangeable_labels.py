@@ -188,12 +188,8 @@ def regimes(filter):
         initial_dist=lambda P: [pm.Categorical.dist(psf.stationary(P))],
         shapes={"P": (2, 2), "mean": (2,), "noise": (2,)},
     )
-    y = psf.simulate(
-        system,
-        {"P": [[0.9, 0.1], [0.2, 0.8]], "mean": [0.0, 2.0], "noise": [0.5, 0.5]},
-        steps=range(30),
-        random_seed=1,
-    )["observations"].values
+    rng = np.random.default_rng(1)
+    y = 2.0 * (np.cumsum(rng.random(30) < 0.15) % 2) + 0.5 * rng.standard_normal(30)
     with pm.Model() as model:
         pm.Dirichlet("P", np.array([[9.0, 1.0], [1.0, 9.0]]))
         pm.Normal("mean", 0, 5, shape=2)
