@@ -8,6 +8,7 @@ import xarray as xr
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.filter_checks.checks import kept
+from pymc_statespace_filters.parameter_particles.filter_doubts import kept_from
 from tests.sampling.test_filter_check import N, model_of, outcome_of
 
 SETTINGS = {"random_seed": 1, "progressbar": False, "populations": 4}
@@ -56,5 +57,8 @@ def test_what_holds_for_further_rows():
     assert kept(_with_outcome("off", "EnKF(50)"), psf.EnKF(50))["d"]["outcome"] == "off"
     assert not kept(_with_outcome("off", "EnKF(50)"), psf.EnKF(100))
     assert not kept(_with_outcome("no sign", "EKF()"), psf.EKF())
+    tree, is_exact = xr.DataTree(), kept_from(_with_outcome("exact", "BootstrapPF(50)"))
+    assert not is_exact(tree, psf.BootstrapPF(100), 1.0)  # no doubt, and what is known stays
+    assert "BootstrapPF(100)" in tree.attrs["filter_check"]
     (doubled,) = kept(_with_outcome("exact", "BootstrapPF(50)"), psf.BootstrapPF(100)).values()
     assert (doubled["filter"], doubled["outcome"]) == ("BootstrapPF(100)", "exact")

@@ -361,6 +361,7 @@ def test_a_score_counts_from_a_row_on():
     error = np.hypot(one["log_evidence_se"], other["log_evidence_se"])
     assert abs(one["log_evidence"] - other["log_evidence"]) < 4 * error < 1.0
     assert (both[1]["smc"]["score"][:2] == 0).all()
+    assert np.isnan(both[1]["smc"]["pit"][:4, 0]).values.tolist() == [True, True, False, False]
 
 
 def test_several_parameters_and_observables():

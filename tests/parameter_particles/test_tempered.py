@@ -8,6 +8,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from scipy.special import softmax
 from scipy.stats import multivariate_normal
 
 import pymc_statespace_filters as psf
@@ -65,6 +66,22 @@ def test_the_result_is_that_of_a_sampler(conjugate_run):
     error = np.hypot(found.se, conjugate_run.attrs["log_evidence_se"])
     assert abs(found.log_evidence - conjugate_run.attrs["log_evidence"]) < 4 * error
     assert list(conjugate_run["evidence"]["estimator"].values) == ["smc", "bridge"]
+
+
+def test_populations_have_draws_in_proportion_to_their_evidence(conjugate_run):
+    """The number of copies of a particle differs from its expectation by less than one."""
+    population = conjugate_run["sample_stats"]["population"].values.ravel()
+    assert (np.diff(population) >= 0).all()
+    shares = np.bincount(population, minlength=10) / population.size
+    expected = softmax(conjugate_run["smc"]["log_evidence"].values)
+    np.testing.assert_allclose(shares, expected, atol=1.01 / population.size)
+
+
+def test_evaluations_are_counted(conjugate_run):
+    """Eleven populations of 23 chains, each of which proposes eight steps."""
+    course = conjugate_run["smc"].to_dataset()
+    assert (course["n_steps"] == 8).all()
+    assert (course["n_evaluated"] == 11 * 23 * 8).all()
 
 
 def test_the_seed_determines_the_result(conjugate_run):
