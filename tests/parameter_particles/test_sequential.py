@@ -364,6 +364,14 @@ def test_a_score_counts_from_a_row_on():
     assert np.isnan(both[1]["smc"]["pit"][:4, 0]).values.tolist() == [True, True, False, False]
 
 
+def test_a_filter_that_has_failed_at_a_row_without_a_score_has_failed():
+    rows = ObservedRows.of(model(psf.EKF(), score_from=1))
+    terms, states = np.array([[-np.inf, -1.0], [-2.0, np.nan]]), np.zeros((2, 1))
+    rows.__dict__["_run"] = lambda *arguments: (terms, states)
+    found, _ = rows.filtered(np.zeros((2, 1)), np.empty((2, 0), int), states, 0, 2)
+    np.testing.assert_array_equal(found, [[-np.inf, -1.0], [0.0, -np.inf]])
+
+
 def test_several_parameters_and_observables():
     with pm.Model() as built:
         pm.Normal("a", 0.5, 0.5)

@@ -14,11 +14,11 @@ from scipy.stats import multivariate_normal
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.parameter_particles.output import _doubts
-from pymc_statespace_filters.parameter_particles.request import Run
+from pymc_statespace_filters.parameter_particles.request import Run, check_alive
 from pymc_statespace_filters.pymc_model.density import ModelDensity
 from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
 from pymc_statespace_filters.smc.bridge import Cloud
-from pymc_statespace_filters.smc.particles import Populations
+from pymc_statespace_filters.smc.particles import Particles, Populations
 from tests.parameter_particles.autoregression import exact, model
 
 Y = np.random.default_rng(1).normal(1.0, 1.0, 12)
@@ -131,6 +131,22 @@ def test_bad_input():
         pm.Uniform("y", pm.Normal("m"), 100.0, observed=-100.0)
     with pytest.raises(ModelError, match="positive at 0 of 10 draws of the prior"):
         psf.sample_smc(10, model=impossible)
+
+
+def test_a_pilot_needs_particles_that_can_be_moved():
+    """Four of one parameter."""
+    with pm.Model() as built:
+        pm.Normal("y", pm.Normal("m"), 1.0, observed=0.0)
+
+    def cloud(n_alive):
+        zero, none = np.zeros(9), np.empty((9, 0))
+        increment = np.where(np.arange(9) < n_alive, 0.0, -np.inf)
+        particles = Particles(zero[:, None], zero, zero, increment, none.astype(int), none)
+        return Cloud(Populations.of_equal_weights(particles, 1), None)
+
+    check_alive(built, cloud(4))
+    with pytest.raises(ModelError, match="positive at 3 of 9 draws of the prior, fewer than 4"):
+        check_alive(built, cloud(3))
 
 
 def test_populations_that_differ_and_moves_that_fail_are_doubts():
