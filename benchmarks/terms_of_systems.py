@@ -140,7 +140,7 @@ def oscillator(seed):
     sets = np.array(list(product([False, True], repeat=len(absent))))
     found = []
     for present in sets:
-        model = model_of(case, psf.EKF(), compress(absent, present))
+        model = model_of(case, psf.EKF(), tuple(compress(absent, present)))
         idata = psf.sample(model=model, random_seed=seed, kernel=kernel, **QUIET)
         found.append(psf.chib_jeliazkov(idata, model, random_seed=seed, progressbar=False))
     other = by_evidence(

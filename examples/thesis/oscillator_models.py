@@ -1,6 +1,6 @@
 """The unknowns of the mass-spring-damper as PyMC models, in coordinates that mix."""
 
-from collections.abc import Iterable
+from collections.abc import Collection
 from functools import partial
 
 import pymc as pm
@@ -27,7 +27,7 @@ FORCES = {"k_f": "slack", "k_h": "friction"}  # the force that a plateau takes a
 def model_of(
     case: Case,
     filter: psf.EKF | psf.EnKF | psf.PFEnKF,
-    nonlinearities: Iterable[str] = NONLINEARITIES,
+    nonlinearities: Collection[str] = NONLINEARITIES,
     wider: float = 1.0,
 ) -> pm.Model:
     """Return the model of a record, with some or (by default) all of the nonlinearities.
