@@ -1,0 +1,51 @@
+"""Rows of a calculation that ranks share, on one rank that plays the first of two."""
+
+import signal
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from pymc_statespace_filters.parallel.shared_rows import evaluated_rows, rows_shared_by
+
+COLUMN = np.arange(5.0)
+
+
+def first_of_two(shared):
+    """Ranks that run a step and note which rows each of them has."""
+    return SimpleNamespace(
+        size=2,
+        rank=0,
+        run_collectively=lambda step, mark: step(),
+        share_rows=lambda results, ends: shared.append(ends),
+    )
+
+
+def doubled(column=COLUMN):
+    return evaluated_rows(lambda rows: [2 * column[rows]], [column], lambda m: [np.zeros(m)])
+
+
+def test_each_rank_evaluates_its_own_rows():
+    shared = []
+    with rows_shared_by(first_of_two(shared)):
+        (found,) = doubled()
+    assert shared == [[(0, 2), (2, 5)]]
+    assert found.tolist() == [0.0, 2.0, 0.0, 0.0, 0.0]  # the other rank's would come
+    assert doubled()[0].tolist() == [0.0, 2.0, 4.0, 6.0, 8.0]
+
+
+def test_fewer_rows_than_ranks_are_evaluated_by_each():
+    shared = []
+    with rows_shared_by(first_of_two(shared)):
+        assert doubled(COLUMN[3:4])[0].tolist() == [6.0]
+    assert not shared
+
+
+def test_an_interrupt_ends_a_shared_evaluation():
+    """The step tells the other ranks of it."""
+    shared = []
+    with rows_shared_by(first_of_two(shared)):
+        signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            doubled()
+    assert not shared
