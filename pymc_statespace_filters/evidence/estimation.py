@@ -15,6 +15,7 @@ from ..errors import INSIDE, EvidenceWarning, ModelError
 from ..filters.protocol import Filter
 from ..parallel.cpu_affinity import cores_set_to
 from ..pymc_model.in_step import shared_by_ranks
+from ..pymc_model.inspection import given_model
 from ..pymc_model.posterior_draws import are_populations
 from ..system.checks import check_count, check_positive
 from .agreement import Agreement, assess_agreement
@@ -300,6 +301,7 @@ def estimate_evidence(
     >>> bool(found.agreement)
     True
     """
+    model = given_model(model)
     if estimators is None:
         is_fit_enough = filter is not None or are_populations(idata)
         estimators = "importance" if is_fit_enough else DEFAULT

@@ -20,6 +20,7 @@ from .screening import N_SCREENED, Announce, improved, proposals_of, screened
 from .unused import Uses
 
 FEWEST = 100  # points of a sub-model within reach
+HIDDEN = 0.1  # of such an influence: a heavy tail may hide most of an evidence
 LARGE, ENOUGH = 0.01, 1000  # such an influence, and the points of such a sub-model at least
 TARGET_SE, NOISY_SE = 0.005, 0.01  # of an inclusion; with likelihoods that are estimates
 N_ROUNDS, MOST_POINTS = 6, 50_000  # of points that are added to reach it
@@ -95,16 +96,18 @@ def _with_lighter_tails(
 ) -> list[Weighted]:
     """Fresh points of better proposals, where weights that matter have a heavy tail."""
     influence = probabilities(found, sets, log_prior).influence()
-    poor = [i for i, one in enumerate(found) if influence[i] > LARGE and not one.is_reliable]
-    counts = [found[i].count for i in poor]
-    announce("better proposals", 2 * sum(counts))
-    trials = sampler.draw([found[i].refitted(rng) for i in poor], counts)
-    lighter = [
-        (i, one) for i, one in zip(poor, trials, strict=True) if one.pareto_k < found[i].pareto_k
-    ]
-    fresh = sampler.draw([one.proposal for _, one in lighter], [one.count for _, one in lighter])
+    matters = influence > HIDDEN * LARGE
+    poor = [i for i in np.flatnonzero(matters).tolist() if not found[i].is_reliable]
+    trials = improved([found[i].proposal for i in poor], sampler, rng, announce, ENOUGH)
     better = list(found)
-    for (i, _), one in zip(lighter, fresh, strict=True):
+    good = [
+        (i, one) for i, one in zip(poor, trials, strict=True)
+        if one.efficiency > found[i].efficiency
+    ]  # fmt: skip
+    counts = [max(found[i].count, ENOUGH) for i, _ in good]
+    announce("better proposals", sum(counts))
+    fresh = sampler.draw([one.proposal for _, one in good], counts)
+    for (i, _), one in zip(good, fresh, strict=True):
         better[i] = one
     return better
 

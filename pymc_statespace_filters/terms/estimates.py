@@ -15,6 +15,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from ..importance import (
     MIN_EFFECTIVE,
@@ -95,9 +96,18 @@ class Weighted:
         return replace(self, x=self.x[:0], seeds=self.seeds[:0])
 
     def refitted(self, rng: np.random.Generator, others: Sequence["Weighted"] = ()) -> Proposal:
-        """The proposal fitted to the weighted points, and to those of other proposals."""
-        x = np.concatenate([self.x, *(one.x for one in others)])
-        log_weights = np.concatenate([self.log_weights, *(one.log_weights for one in others)])
+        """The proposal fitted to the weighted points, and to those of other proposals.
+
+        All points are weighted as if drawn from the mixture of their proposals, so that no lucky
+        point of a poor one has all the weight (Cornuet, Marin, Mira and Robert 2012).
+        """
+        every = [self, *others]
+        counts = [one.count for one in every]
+        x = np.concatenate([one.x for one in every])
+        log_q = np.array([one.proposal.log_density_of_drawn(x) for one in every])
+        own = log_q[np.repeat(np.arange(len(every)), counts), np.arange(len(x))]
+        mixed = logsumexp(log_q, axis=0, b=np.array(counts)[:, None] / len(x))
+        log_weights = np.concatenate([one.log_weights for one in every]) + own - mixed
         return self.proposal.refitted(x, log_weights, rng)
 
 

@@ -71,6 +71,10 @@ class Proposal:
         x, log_volume = self.coordinates.backward(y, self.drawn)
         return x, self.mixture.log_density(drawn) + log_volume
 
+    def log_density_of_drawn(self, x: Array) -> Array:
+        """Log-density (n,) of the coordinates that are drawn from the mixture, at points (n, k)."""
+        return self.mixture.log_density(self.coordinates.forward(x)[:, self.drawn])
+
     def refitted(self, x: Array, log_weights: Array, rng: np.random.Generator) -> "Proposal":
         """Fitted to weighted points of proposals; the same if these have no weights.
 

@@ -16,6 +16,7 @@ from .proposals import Guide, Proposal
 from .unused import Uses
 
 N_SCREENED = 25  # points of every sub-model
+MOST_SCREENED = 20_000  # of all sub-models, in each repetition with twice as many points of each
 FEWEST_EFFECTIVE = 3.0  # of them, that say something about the evidence
 REACH = 10.0  # nats below the most probable sub-model, beyond which one is left as it is
 N_PILOT, GOOD = 200, 0.25  # points that judge a proposal; effective points per point that suffice
@@ -48,15 +49,20 @@ def screened(
     The height of the best is at least ``highest``.
     """
     found = sampler.draw(proposals, [N_SCREENED] * len(proposals))
+    before: list[list[Weighted]] = [[] for _ in found]
+    most, count = np.array([_at_most(one) for one in found]), N_SCREENED
     for _ in range(N_REFITS):
-        within = _within_reach(found, log_prior, highest)
+        within = _within_reach(found, most, log_prior, highest)
         again = [i for i in np.flatnonzero(within) if is_worthless(found[i])]
         if not again:
             break
-        drawn = sampler.draw([found[i].refitted(rng) for i in again], [N_SCREENED] * len(again))
-        for i, one in zip(again, drawn, strict=True):
+        count = max(N_SCREENED, min(2 * count, MOST_SCREENED // len(again)))
+        refitted = [found[i].refitted(rng, before[i]) for i in again]
+        for i, one in zip(again, sampler.draw(refitted, [count] * len(again)), strict=True):
+            before[i].append(found[i])
             found[i] = one
-    return found, _within_reach(found, log_prior, highest)
+            most[i] = max(most[i], _at_most(one))
+    return found, _within_reach(found, most, log_prior, highest)
 
 
 def is_worthless(points: Weighted) -> bool:
@@ -64,10 +70,11 @@ def is_worthless(points: Weighted) -> bool:
     return points.n_effective < FEWEST_EFFECTIVE
 
 
-def _within_reach(found: Sequence[Weighted], log_prior: Array, highest: float) -> NDArray[np.bool_]:
+def _within_reach(
+    found: Sequence[Weighted], most: Array, log_prior: Array, highest: float
+) -> NDArray[np.bool_]:
     height = log_prior + [one.mean.value for one in found]
-    most = log_prior + [_at_most(one) for one in found]
-    return np.asarray(most > max(height.max(), highest) - REACH)
+    return np.asarray(log_prior + most > max(height.max(), highest) - REACH)
 
 
 def _at_most(points: Weighted) -> float:
@@ -83,16 +90,23 @@ def _at_most(points: Weighted) -> float:
 
 
 def improved(
-    proposals: Sequence[Proposal], sampler: Sampler, rng: np.random.Generator, announce: Announce
+    proposals: Sequence[Proposal],
+    sampler: Sampler,
+    rng: np.random.Generator,
+    announce: Announce,
+    count: int = N_PILOT,
 ) -> list[Weighted]:
-    """Proposals that are fitted again until they are good, each with the points that judged it."""
+    """Proposals that are fitted again until they are good, each with the points that judged it.
+
+    Each is judged by ``count`` points.
+    """
     current = list(proposals)
     best: dict[int, Weighted] = {}
     before: list[list[Weighted]] = [[] for _ in current]
     pending = list(range(len(current)))
     for _ in range(N_REFITS + 1):
-        announce("proposals", N_PILOT * len(pending))
-        drawn = sampler.draw([current[i] for i in pending], [N_PILOT] * len(pending))
+        announce("proposals", count * len(pending))
+        drawn = sampler.draw([current[i] for i in pending], [count] * len(pending))
         poor = []
         for i, one in zip(pending, drawn, strict=True):
             if i not in best or one.efficiency > best[i].efficiency:

@@ -39,7 +39,7 @@ def normal_model(sd=1.0):
 
 @pytest.fixture(scope="module")
 def models():
-    return {"cheap one": normal_model(), "dear/one": state_space_model(psf.BootstrapPF(50))}
+    return {"cheap one": normal_model(), "dear/one": state_space_model(psf.BootstrapPF(500))}
 
 
 def test_each_model_as_if_alone(models):

@@ -1,8 +1,12 @@
 """Which sub-models are within reach, and how many points go to which."""
 
+from typing import NamedTuple
+
 import numpy as np
 import pymc as pm
+from scipy.stats import norm
 
+from pymc_statespace_filters.importance import log_mean_of_independent
 from pymc_statespace_filters.terms import enumeration, screening
 from pymc_statespace_filters.terms.candidates import read_candidates
 from pymc_statespace_filters.terms.estimates import Weighted
@@ -31,10 +35,41 @@ def test_no_sub_model_is_out_of_reach_by_points_that_say_nothing():
         np.full(25, -np.inf),
     ]
     found = [Weighted(None, np.empty((25, 0)), np.empty((25, 0), int), one) for one in weights]
-    within = screening._within_reach(found, np.zeros(6), -np.inf)
+    most = np.array([screening._at_most(one) for one in found])
+    within = screening._within_reach(found, most, np.zeros(6), -np.inf)
     assert found[3].n_effective > screening.FEWEST_EFFECTIVE
     assert within.tolist() == [True, False, True, True, False, False]
-    assert not screening._within_reach(found, np.zeros(6), 1000.0).any()
+    assert not screening._within_reach(found, most, np.zeros(6), 1000.0).any()
+    # What earlier points may have missed is not forgotten.
+    within = screening._within_reach(found[:2], np.array([0.0, 5.0]), np.zeros(2), -np.inf)
+    assert within.tolist() == [True, True]
+
+
+class Normal(NamedTuple):
+    """A proposal of one coordinate, which returns what it is to be fitted to."""
+
+    sd: float
+
+    def log_density_of_drawn(self, x):
+        return norm.logpdf(x[:, 0], scale=self.sd)
+
+    def refitted(self, x, log_weights, rng):
+        return x, log_weights
+
+
+def test_points_of_several_proposals_are_weighted_as_of_their_mixture():
+    """Their mean is the integral, 2, and few points of the narrow one have no large weights."""
+    rng, found = np.random.default_rng(1), []
+    for sd, n in ((0.2, 1000), (1.5, 4000)):
+        x = sd * rng.standard_normal((n, 1))
+        log_weights = np.log(2) + norm.logpdf(x[:, 0]) - norm.logpdf(x[:, 0], scale=sd)
+        found.append(Weighted(Normal(sd), x, np.empty((n, 0), int), log_weights))
+    x, log_weights = found[1].refitted(rng, found[:1])
+    mean, error = log_mean_of_independent(log_weights)
+    assert len(x) == 5000
+    assert abs(mean - np.log(2)) < 4 * error < 0.04
+    # At most what the wide one alone gives: its weight there, over its share of the points.
+    assert log_weights.max() < np.log(2 * 1.5 / 0.8) < found[0].log_weights.max()
 
 
 def test_errors_of_probabilities_are_those_of_uncertain_evidences():
