@@ -204,9 +204,10 @@ def fit_mixture(x: Array, mixture: StudentMixture) -> StudentMixture:
 
 
 def _log_sum(log_joint: Array) -> Array:
-    """Log of the sum over components (J, m) of finite terms; SciPy's takes longer than a fit."""
-    peak = log_joint.max(axis=0)
-    return np.asarray(peak + np.log(np.exp(log_joint - peak).sum(axis=0)))
+    """Log of the sum over components (J, m); SciPy's takes longer than a fit."""
+    peak = np.maximum(log_joint.max(axis=0), np.finfo(np.float64).min)  # where all are zero
+    with np.errstate(divide="ignore"):
+        return np.asarray(peak + np.log(np.exp(log_joint - peak).sum(axis=0)))
 
 
 def _m_step(mixture: StudentMixture, x: Array, responsibilities: Array) -> StudentMixture:

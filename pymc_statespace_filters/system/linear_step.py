@@ -57,8 +57,8 @@ def make_functions(compiled: Callable) -> LinearStepFunctions:
                 out[i, j] += a[i, j]
 
     @compiled
-    def copy_into(out, a):
-        """out = a, as fast."""
+    def assign(out, a):
+        """out = a; numba takes a second to compile ``out[:] = a``, for its message about shapes."""
         for i in range(a.shape[0]):
             for j in range(a.shape[1]):
                 out[i, j] = a[i, j]
@@ -146,7 +146,7 @@ def make_functions(compiled: Callable) -> LinearStepFunctions:
         add(q_bar, phi, 1.0, half)
         add(half, q, 2.0, before)
         add_right(c_bar, c, 1.0, before)
-        copy_into(phi_bar, before)
+        assign(phi_bar, before)
         add_left(phi, half, 1.0, q_bar)
         copy = c_bar.copy()
         add_left(phi, copy, 1.0, c_bar)
@@ -166,8 +166,8 @@ def make_functions(compiled: Callable) -> LinearStepFunctions:
             add(spread_bar, a, 1.0 / (m + 1), spread_before)
             add_left(a, shift_bar, 1.0 / (m + 1), shift_before)
             power_bar, spread_bar, shift_bar = power_before, spread_before, shift_before
-        copy_into(q_bar, spread_bar)
-        copy_into(c_bar, shift_bar)
+        assign(q_bar, spread_bar)
+        assign(c_bar, shift_bar)
 
     @compiled
     def run(given, n, k, a, powers, spreads, shifts, phi, q, c):

@@ -20,8 +20,12 @@ from .screening import N_SCREENED, Announce, improved, proposals_of, screened
 from .unused import Uses
 
 FEWEST = 100  # points of a sub-model within reach
-HIDDEN = 0.1  # of such an influence: a heavy tail may hide most of an evidence
-LARGE, ENOUGH = 0.01, 1000  # such an influence, and the points of such a sub-model at least
+LARGE, ENOUGH = (
+    0.01,
+    1000,
+)  # an influence on inclusions, and the points of such a sub-model at least
+HIDDEN = 0.1  # part of it that counts where a heavy tail may hide most of an evidence
+MOST_POOR = 8  # sub-models that get better proposals, for some thousand points each
 TARGET_SE, NOISY_SE = 0.005, 0.01  # of an inclusion; with likelihoods that are estimates
 N_ROUNDS, MOST_POINTS = 6, 50_000  # of points that are added to reach it
 
@@ -96,13 +100,13 @@ def _with_lighter_tails(
 ) -> list[Weighted]:
     """Fresh points of better proposals, where weights that matter have a heavy tail."""
     influence = probabilities(found, sets, log_prior).influence()
-    matters = influence > HIDDEN * LARGE
-    poor = [i for i in np.flatnonzero(matters).tolist() if not found[i].is_reliable]
+    matter = np.argsort(-influence)[: (influence > HIDDEN * LARGE).sum()].tolist()
+    poor = [i for i in matter if not found[i].is_reliable][:MOST_POOR]
     trials = improved([found[i].proposal for i in poor], sampler, rng, announce, ENOUGH)
     better = list(found)
     good = [
         (i, one) for i, one in zip(poor, trials, strict=True)
-        if one.efficiency > found[i].efficiency
+        if one.is_reliable or one.pareto_k < found[i].pareto_k
     ]  # fmt: skip
     counts = [max(found[i].count, ENOUGH) for i, _ in good]
     announce("better proposals", sum(counts))

@@ -16,8 +16,8 @@ from .proposals import Guide, Proposal
 from .unused import Uses
 
 N_SCREENED = 25  # points of every sub-model
-MOST_SCREENED = 20_000  # of all sub-models, in each repetition with twice as many points of each
-FEWEST_EFFECTIVE = 3.0  # of them, that say something about the evidence
+MOST_SCREENED = 20_000  # points of all sub-models that are drawn again, unless 25 each are more
+FEWEST_EFFECTIVE = 3.0  # effective points that say something about the evidence
 REACH = 10.0  # nats below the most probable sub-model, beyond which one is left as it is
 N_PILOT, GOOD = 200, 0.25  # points that judge a proposal; effective points per point that suffice
 N_REFITS = 5

@@ -1,6 +1,7 @@
 """Estimates from draws of `sample_smc`, of which only the populations are independent."""
 
 import numpy as np
+import pymc as pm
 import pytest
 import xarray as xr
 from scipy.stats import norm
@@ -95,7 +96,7 @@ def test_the_default_is_importance_sampling(monkeypatch):
 
     monkeypatch.setattr(estimation, "run_estimators", run)
     tree = xr.DataTree()
-    estimation.estimate_evidence(tree)
+    estimation.estimate_evidence(tree, pm.Model())
     tree.attrs["sampler"] = BY_PARTICLES
-    estimation.estimate_evidence(tree)
+    estimation.estimate_evidence(tree, pm.Model())
     assert chosen == [["chib_jeliazkov", "bridge"], ["importance"]]

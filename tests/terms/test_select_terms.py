@@ -426,7 +426,7 @@ def poor_draws(centre, width, n_terms=4):
     return draws_of_values({f"b{i}": one for i, one in enumerate([*b[:-1], abs(b[-1])])})
 
 
-@pytest.mark.parametrize(("centre", "width"), [(0.0, 3.0), (2.0, 0.1)])
+@pytest.mark.parametrize(("centre", "width"), [(0.0, 3.0), (2.0, 0.1), (0.5, 0.01)])
 def test_draws_of_another_law_change_no_result(centre, width):
     regression = few_terms()
     model = regression.model(as_system=False)
