@@ -21,7 +21,7 @@ from ..progress import row_progress
 from ..pymc_model.density import ModelDensity
 from ..pymc_model.inspection import exactness
 from ..pymc_model.other_filter import model_of_draws
-from ..pymc_model.posterior_draws import noise_was_moved, posterior_group
+from ..pymc_model.posterior_draws import are_populations, noise_was_moved, posterior_group
 from ..pymc_model.prior import Support
 from ..unvisited.sentences import stored, unvisited
 from .checks import check_convergence, check_discretisation
@@ -126,10 +126,13 @@ def run_estimators(
 def _missed(
     idata: xr.DataTree, model: pm.Model, posterior: Posterior, rng: np.random.Generator
 ) -> list[str]:
-    """What the chains have missed, as was found at the end of their run or is found now."""
+    """What the draws have missed, as was found at the end of their run or is found now.
+
+    Now only of chains: populations fill their tails otherwise, and have a look of their own.
+    """
     if (known := stored(idata)) is not None:
         return known
-    if posterior.log_density.size < LEAST_DRAWS:
+    if are_populations(idata) or posterior.log_density.size < LEAST_DRAWS:
         return []
     parts = posterior.draws, posterior.log_density, posterior.evaluate
     return by_first_rank(lambda: unvisited(model, *parts, CHECK_SECONDS, rng))

@@ -7,7 +7,7 @@ import xarray as xr
 from scipy.stats import norm
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence import estimation
+from pymc_statespace_filters.evidence import estimation, runner
 from pymc_statespace_filters.evidence.estimators.bridge import Bridge
 from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
 from pymc_statespace_filters.evidence.posterior import Posterior
@@ -85,6 +85,16 @@ def test_populations_are_read_from_the_result():
     stats = xr.Dataset({"population": (("chain", "draw"), [[0, 0, 0], [0, 1, 1]])})
     tree["sample_stats"] = xr.DataTree(stats)
     assert populations_of(tree).tolist() == [[0, 0, 0], [0, 1, 1]]
+
+
+def test_what_chains_have_missed_is_not_looked_for_in_populations(monkeypatch):
+    monkeypatch.setattr(runner, "unvisited", lambda *args: ["the chains have missed a part"])
+    x = np.zeros((4, 1000, 2))
+    posterior, rng = Posterior(x, log_density(x), log_density), np.random.default_rng(1)
+    tree = xr.DataTree()
+    assert runner._missed(tree, None, posterior, rng)
+    tree.attrs["sampler"] = BY_PARTICLES
+    assert not runner._missed(tree, None, posterior, rng)
 
 
 def test_the_default_is_importance_sampling(monkeypatch):
