@@ -8,7 +8,7 @@ a number of evaluations that fits a budget, is decided by the first rank alone.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from itertools import pairwise
 from threading import Event
@@ -45,6 +45,21 @@ def rows_shared_by(comm: Communicator) -> Iterator[None]:
             yield
         finally:
             _ranks.reset(token)
+
+
+@contextmanager
+def outlasting_interrupts() -> Iterator[None]:
+    """Let an interrupt end the block, and not what comes after it.
+
+    Ranks, of which one alone may be interrupted, evaluate the block to its end.
+    """
+    ranks = _ranks.get()
+    token = _ranks.set(None if ranks is None else ranks._replace(interrupted=Event()))
+    try:
+        with suppress(KeyboardInterrupt):
+            yield
+    finally:
+        _ranks.reset(token)
 
 
 def evaluated_rows(

@@ -89,7 +89,7 @@ def as_datatree(
         "log_evidence": merged,
         "log_evidence_se": error,
     }
-    if run.missed:
+    if run.missed is not None:
         store_unvisited(tree, run.missed)
     support = Support.of(model)
     doubts = [*support.check(), *_doubts(run)]
@@ -156,7 +156,7 @@ def _evidence(
 
 def _doubts(run: Run) -> Iterator[str]:
     """What says that the spread of the populations is no measure of the error."""
-    yield from run.missed
+    yield from run.missed or ()
     shares = normalised(run.log_evidences)
     spread = float(shares.std(ddof=1) / shares.mean())
     if spread > MAX_SPREAD:

@@ -86,13 +86,13 @@ class Request(NamedTuple):
 class Run(NamedTuple):
     """What a run has led to: the particles, the evidence by each population, and its course.
 
-    ``missed`` says of the posterior what the particles lack.
+    ``missed`` says of the posterior what the particles lack; None if nothing has looked.
     """
 
     cloud: Cloud
     log_evidences: NDArray[np.float64]  # (R,)
     course: xr.Dataset
-    missed: Sequence[str] = ()
+    missed: Sequence[str] | None = None
 
 
 def checked_request(

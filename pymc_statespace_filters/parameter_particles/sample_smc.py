@@ -14,7 +14,7 @@ from ..evidence.estimators.maximum_likelihood import max_log_likelihood
 from ..evidence.posterior import Posterior, observed_in
 from ..filters.protocol import Filter
 from ..filters.recommendation import short_form
-from ..parallel.shared_rows import by_first_rank
+from ..parallel.shared_rows import by_first_rank, outlasting_interrupts
 from ..progress import stage_progress
 from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.inspection import given_model, is_filter
@@ -89,9 +89,10 @@ def sample_smc(
         Whether to show the stage, its effective size and acceptance, after two seconds.
     compute_convergence_checks : bool
         Whether to compare filters that are not exact with unbiased ones at the end, if there are
-        600 particles or more; see `check_filter`. Ctrl-C ends the comparison without an outcome.
-        Also, with "tempered", whether to look for modes that the particles have missed, from
-        points on their way, by at most 12 % more evaluations.
+        600 particles or more; see `check_filter`. Also, with "tempered", whether to look for modes
+        that the particles have missed, from points on their way, by at most 12 % more evaluations;
+        a run that goes on from a checkpoint without these points does not look. Ctrl-C ends either
+        without an outcome.
     checkpoint : str or path, optional
         A folder in which the particles are stored every few seconds, after a stage of "tempered" or
         a row of "sequential". If the process ends for any reason, the same call goes on from there,
@@ -122,9 +123,9 @@ def sample_smc(
         the cost, ``n_updates`` of filters. ``evidence`` holds the evidence, as
         `estimate_evidence` stores it, with the estimator "smc"; the attributes ``log_evidence`` and
         ``log_evidence_se`` repeat it, and ``filter_check``, a JSON text, has the outcome of the
-        comparison of filters; ``unvisited``, another one, is there if the particles have missed a
-        mode, and says so. ``smc_state``, of "sequential", is what `extend` goes on
-        from.
+        comparison of filters; ``unvisited``, another one, is there if the run has looked for modes
+        that the particles have missed, and lists a sentence about what it has found, or nothing.
+        ``smc_state``, of "sequential", is what `extend` goes on from.
 
     Raises
     ------
@@ -248,10 +249,10 @@ def _tempered(
 ) -> xr.DataTree:
     began, likelihood = perf_counter(), WholeLikelihood(model, screen)
     with stage_progress(1.0, enabled=progressbar) as show:
-        run, visited = tempered_run(model, likelihood, request, show, steps)
-        if looks:
-            run = run._replace(missed=missed_in(run, visited, model, likelihood, request))
+        run, visited = tempered_run(model, likelihood, request, show, steps, looks=looks)
         maximum = _maximum(likelihood.factors, run, request)
+        with outlasting_interrupts():
+            run = run._replace(missed=missed_in(run, visited, model, likelihood, request))
     seconds = perf_counter() - began
     observed = observed_in(model)
     return as_datatree(

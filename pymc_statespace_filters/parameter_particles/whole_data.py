@@ -13,13 +13,13 @@ from ..pymc_model.other_filter import model_with
 from ..pymc_model.prior import ModelFactors
 from ..smc.bridge import Cloud, Crossed, Stage, cross
 from ..smc.particles import Evaluate, Particles
-from ..unvisited.modes import Visited, joined, missed_mode
+from ..unvisited.modes import LEAST_EVALUATIONS, Visited, joined, missed_mode, thinned
 from ..unvisited.sentences import sentence_of_mode
 from .request import Request, Run, check_alive
 from .stored_run import arrays_of_cloud, cloud_of_arrays
 from .stored_steps import StoredSteps
 
-MOST_VISITED = 10_000  # points of a stage that are kept
+MOST_VISITED = 30_000  # points of all stages that are kept
 LOOK = 0.12  # of the evaluations of a run, that may go into a look for what it has missed
 _LOOK = 2**32 + 3  # key of random numbers beside those of the run
 
@@ -57,25 +57,31 @@ def tempered_run(
     request: Request,
     show: Callable[[float, str], None],
     steps: StoredSteps,
-) -> tuple[Run, Visited]:
+    *,
+    looks: bool,
+) -> tuple[Run, Visited | None]:
     """Lead draws of the prior to the posterior, or particles from where they were stored.
 
-    Also returns points of all stages.
+    Also returns points of all stages if the run ``looks`` at them; None if they were not stored.
     """
     rng = request.generator(0)
     begin: Cloud | Crossed
     if steps.found:
-        begin, visited = _restored(steps.found, rng), [_visited_before(steps.found)]
+        begin = _restored(steps.found, rng)
+        visited = _visited_before(steps.found) if looks else None
     else:
         begin = request.cloud(likelihood.draw(request.n_particles, rng))
         check_alive(model, begin)
-        visited = [_visited(begin, 0)]
+        visited = thinned(_visited(begin, 0), MOST_VISITED) if looks else None
 
     def on_stage(so_far: Crossed) -> None:
+        nonlocal visited
         stage = so_far.stages[-1]
-        visited.append(_visited(so_far.cloud, len(so_far.stages)))
+        if visited is not None:
+            new = _visited(so_far.cloud, len(so_far.stages))
+            visited = thinned(joined([visited, new]), MOST_VISITED)
         steps.save(
-            lambda: _stored(so_far, joined(visited), rng) | request.arrays,
+            lambda: _stored(so_far, visited, rng) | request.arrays,
             is_last=stage.temperature == 1.0,
         )
         sizes = f"effective size {stage.effective_sizes.mean():.0f}"
@@ -91,14 +97,23 @@ def tempered_run(
         screen=likelihood.screen,
         on_stage=on_stage,
     )
-    return Run(found.cloud, found.log_ratio, _course(found.stages)), joined(visited)
+    return Run(found.cloud, found.log_ratio, _course(found.stages)), visited
 
 
 def missed_in(
-    run: Run, visited: Visited, model: pm.Model, likelihood: WholeLikelihood, request: Request
-) -> list[str]:
-    """What the particles of a run lack of the posterior, at the price of a part of the run."""
-    n_evaluated = request.n_particles + int(run.course["n_evaluated"].sum())
+    run: Run,
+    visited: Visited | None,
+    model: pm.Model,
+    likelihood: WholeLikelihood,
+    request: Request,
+) -> list[str] | None:
+    """What the particles of a run lack of the posterior, at the price of a part of the run.
+
+    None without points, or where this part is too small for a look.
+    """
+    n_evaluations = int(LOOK * (request.n_particles + run.course["n_evaluated"].sum().item()))
+    if visited is None or n_evaluations < LEAST_EVALUATIONS:
+        return None
 
     def evaluate(x: Array, rng: np.random.Generator) -> Array:
         found = likelihood.evaluate(x, rng).log_density(1.0)
@@ -109,33 +124,38 @@ def missed_in(
         run.log_evidences,
         visited,
         evaluate,
-        int(LOOK * n_evaluated),
+        n_evaluations,
         request.generator(_LOOK),
     )
     return [] if missed is None else [sentence_of_mode(model, missed, request.draws)]
 
 
 def _visited(cloud: Cloud, stage: int) -> Visited:
-    """Points of a stage, at most `MOST_VISITED`."""
+    """The points of a stage that have a density."""
     parts = [one.particles for one in (cloud.pilot, cloud.others)]
     x = np.concatenate([one.x for one in parts])
     log_density = np.concatenate([one.log_density(1.0) for one in parts])
     alive = np.flatnonzero(np.isfinite(log_density))
-    kept = alive[:: max(1, -(-len(alive) // MOST_VISITED))]
-    return Visited(x[kept], log_density[kept], np.full(len(kept), stage))
+    return Visited(x[alive], log_density[alive], np.full(len(alive), stage))
 
 
-def _visited_before(arrays: Mapping[str, np.ndarray]) -> Visited:
+def _visited_before(arrays: Mapping[str, np.ndarray]) -> Visited | None:
+    """None of a run that did not look, of which the points are lost."""
+    if "visited_x" not in arrays:
+        return None
     return Visited(*(arrays[f"visited_{name}"] for name in Visited._fields))
 
 
-def _stored(so_far: Crossed, visited: Visited, rng: np.random.Generator) -> dict[str, np.ndarray]:
+def _stored(
+    so_far: Crossed, visited: Visited | None, rng: np.random.Generator
+) -> dict[str, np.ndarray]:
     """How far a run is, and its next random numbers, as arrays."""
     columns = zip(*so_far.stages, strict=True)
     stages = {f"stages_{name}": np.array(c) for name, c in zip(Stage._fields, columns, strict=True)}
     generator = np.array(json.dumps(rng.bit_generator.state))
     found = {"log_ratio": so_far.log_ratio, "generator": generator}
-    found |= {f"visited_{name}": values for name, values in visited._asdict().items()}
+    if visited is not None:
+        found |= {f"visited_{name}": values for name, values in visited._asdict().items()}
     return arrays_of_cloud(so_far.cloud) | stages | found
 
 

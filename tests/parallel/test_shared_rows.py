@@ -6,7 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pymc_statespace_filters.parallel.shared_rows import evaluated_rows, rows_shared_by
+from pymc_statespace_filters.parallel.shared_rows import (
+    evaluated_rows,
+    outlasting_interrupts,
+    rows_shared_by,
+)
 
 COLUMN = np.arange(5.0)
 
@@ -49,3 +53,22 @@ def test_an_interrupt_ends_a_shared_evaluation():
         with pytest.raises(KeyboardInterrupt):
             doubled()
     assert not shared
+
+
+def test_what_outlasts_interrupts_is_evaluated_by_all_ranks_to_its_end():
+    shared = []
+    with rows_shared_by(first_of_two(shared)):
+        with outlasting_interrupts():
+            signal.raise_signal(signal.SIGINT)
+            doubled()
+        assert len(shared) == 1
+        with pytest.raises(KeyboardInterrupt):
+            doubled()
+
+
+def test_without_ranks_an_interrupt_ends_it():
+    reached = []
+    with outlasting_interrupts():
+        signal.raise_signal(signal.SIGINT)
+        reached.append("end")
+    assert not reached

@@ -53,9 +53,11 @@ def ending_after(n_steps, monkeypatch):
 def test_a_run_goes_on_where_it_ended(kind, often, tmp_path, monkeypatch):
     """It ends twice; when it is complete, another call reads it.
 
-    The look for modes that were missed is at all points on the way, those before an end included.
+    The look for modes that were missed is at points of the whole way, thinned as it goes on.
     """
     monkeypatch.setattr(whole_data, "missed_mode", found_among)
+    monkeypatch.setattr(whole_data, "LOOK", 10.0)
+    monkeypatch.setattr(whole_data, "MOST_VISITED", 100)
     settings = {**SETTINGS, **KINDS[kind], "model": model(psf.EKF(), 9)}
     whole = psf.sample_smc(**settings)
     for _ in range(2):
@@ -73,6 +75,27 @@ def test_a_run_goes_on_where_it_ended(kind, often, tmp_path, monkeypatch):
         assert found.attrs == whole.attrs
         for name in whole.children:
             assert found[name].to_dataset().equals(whole[name].to_dataset())
+
+
+def test_points_of_the_way_are_stored_only_for_a_look(often, tmp_path, monkeypatch):
+    """Without those before its end a run that goes on does not look."""
+    monkeypatch.setattr(whole_data, "missed_mode", found_among)
+    monkeypatch.setattr(whole_data, "LOOK", 10.0)
+    stored, save = [], StoredSteps.save
+
+    def noted(steps, arrays, **settings):
+        stored.append(arrays())
+        save(steps, arrays, **settings)
+
+    monkeypatch.setattr(StoredSteps, "save", noted)
+    settings = {**SETTINGS, "model": model(psf.EKF(), 9), "checkpoint": tmp_path}
+    with monkeypatch.context() as patch:
+        ending_after(1, patch)
+        with pytest.raises(Ended):
+            psf.sample_smc(**settings, compute_convergence_checks=False)
+    assert "unvisited" not in psf.sample_smc(**settings).attrs
+    assert len(stored) > 1
+    assert not [name for arrays in stored for name in arrays if name.startswith("visited")]
 
 
 def test_a_run_without_a_seed_keeps_its_own(often, tmp_path):

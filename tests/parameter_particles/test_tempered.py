@@ -13,6 +13,7 @@ from scipy.stats import multivariate_normal
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
+from pymc_statespace_filters.parameter_particles import whole_data
 from pymc_statespace_filters.parameter_particles.output import _doubts
 from pymc_statespace_filters.parameter_particles.request import Run, check_alive
 from pymc_statespace_filters.pymc_model.density import ModelDensity
@@ -187,6 +188,25 @@ def test_a_mode_that_all_populations_have_lost_is_a_doubt():
     unchecked = psf.sample_smc(200, compute_convergence_checks=False, **settings)
     assert "unvisited" not in unchecked.attrs
     assert unchecked["posterior"].to_dataset().equals(idata["posterior"].to_dataset())
+
+
+def test_a_run_that_lacks_nothing_says_so(conjugate_run):
+    assert json.loads(conjugate_run.attrs["unvisited"]) == []
+
+
+def test_an_interrupt_of_the_look_keeps_the_run(conjugate_run, monkeypatch):
+    def interrupted(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(whole_data, "missed_mode", interrupted)
+    found = psf.sample_smc(200, model=conjugate(), random_seed=4, progressbar=False)
+    assert "unvisited" not in found.attrs
+    assert found["posterior"].to_dataset().equals(conjugate_run["posterior"].to_dataset())
+
+
+def test_a_run_too_short_for_a_look_does_not_say_that_it_has_looked():
+    few = psf.sample_smc(20, model=conjugate(), populations=2, random_seed=1, progressbar=False)
+    assert "unvisited" not in few.attrs
 
 
 def test_populations_with_hardly_a_particle_of_positive_likelihood_are_a_doubt():
