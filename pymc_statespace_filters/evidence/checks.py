@@ -25,7 +25,6 @@ from collections.abc import Iterator
 import numpy as np
 import pymc as pm
 import xarray as xr
-from arviz_stats import ess, rhat
 from numpy.typing import NDArray
 from scipy.special import softmax
 from scipy.stats import rankdata
@@ -60,6 +59,8 @@ def check_convergence(posterior: Posterior, idata: xr.DataTree | None = None) ->
     """
     if are_populations(idata):
         return
+    from arviz_stats import ess, rhat  # loads much: see `importance`
+
     parameters = np.moveaxis(posterior.draws, -1, 0)
     with np.errstate(invalid="ignore"):  # R-hat of a constant parameter is 0 / 0
         rhats = [float(rhat(values)) for values in parameters]

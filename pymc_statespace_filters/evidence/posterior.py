@@ -13,7 +13,6 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import pymc as pm
 import xarray as xr
-from arviz_stats import ess
 from numpy.typing import NDArray
 
 from ..errors import DataMismatchError, ModelError
@@ -112,10 +111,12 @@ class Posterior:
 
     def ess(self, terms: Array) -> float:
         """How many independent draws the mean of terms (chain, draw) is worth, at least one."""
-        if self.population is None:
-            return float(ess(terms, method="mean"))
-        error = self.mcse(terms)
-        return max(1.0, float(terms.var()) / error**2) if error > 0 else float(terms.size)
+        if self.population is not None:
+            error = self.mcse(terms)
+            return max(1.0, float(terms.var()) / error**2) if error > 0 else float(terms.size)
+        from arviz_stats import ess  # loads much: see `importance`
+
+        return float(ess(terms, method="mean"))
 
     def log_mean(self, log_terms: Array) -> LogMean:
         """Log of the mean of positive terms (chain, draw), one of each draw, with its error."""

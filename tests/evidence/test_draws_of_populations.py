@@ -1,5 +1,8 @@
 """Estimates from draws of `sample_smc`, of which only the populations are independent."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pymc as pm
 import pytest
@@ -74,6 +77,15 @@ def test_the_error_of_a_mean_is_that_of_unequal_clusters():
     terms, population = np.array([1.0, 3.0, 5.0, 5.0]), np.array([0, 0, 1, 1])
     expected = np.sqrt(2 * (0.25 * 1.5**2 * 2)) * 12.706 / 1.96
     assert mcse_of_populations(terms, population) == pytest.approx(expected, rel=1e-3)
+
+
+def test_importing_posteriors_leaves_the_statistics_of_arviz_alone():
+    """As `sample_smc` imports them."""
+    script = (
+        "import sys, pymc_statespace_filters.evidence.posterior; "
+        "sys.exit('arviz_stats' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", script], timeout=120, check=False).returncode == 0
 
 
 def test_populations_are_read_from_the_result():

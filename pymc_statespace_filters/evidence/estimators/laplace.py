@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from arviz_stats import mcse
 from numpy.typing import NDArray
 
 from ...errors import ModelError
@@ -135,6 +134,8 @@ def _check(posterior: Posterior, at_mode: float, log_dets: tuple[float, float]) 
             f"the step size of the differences changes it by {effect:.2g} nats: the log-density "
             "is rugged, as with a held noise seed; use an estimator that averages over draws"
         )
+    from arviz_stats import mcse  # loads much: see `importance`
+
     # Draws of a Gaussian lie k / 2 below the mode on average; heavy tails or further modes, lower.
     depth = at_mode - posterior.log_density
     expected = 0.5 * posterior.draws.shape[-1]
