@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pymc as pm
@@ -11,8 +12,10 @@ from scipy.stats import norm
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence import estimation, runner
+from pymc_statespace_filters.evidence.estimators.block_ordinates import estimate_in_blocks
 from pymc_statespace_filters.evidence.estimators.bridge import Bridge
 from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
+from pymc_statespace_filters.evidence.estimators.random_walk_proposal import Proposal
 from pymc_statespace_filters.evidence.posterior import Posterior
 from pymc_statespace_filters.importance import mcse_of_populations
 from pymc_statespace_filters.pymc_model.posterior_draws import BY_PARTICLES, populations_of
@@ -43,6 +46,21 @@ def test_errors_are_those_of_few_independent_populations(estimator):
         found = estimator.estimate(particles(rng), rng=rng)
         z.append(found.log_evidence / found.se)
     assert 0.3 < np.mean(np.square(z)) < 2.0
+
+
+def test_the_error_of_blocks_is_that_of_populations():
+    """Populations of different widths in turn, which in chains would cancel."""
+    population = np.broadcast_to(np.arange(800) % 4, (1, 800))
+    widths = np.array([0.5, 0.8, 1.1, 1.4])[population]
+    x = widths[..., None] * np.random.default_rng(6).standard_normal((1, 800, 2))
+    posterior = Posterior(x, log_density(x), lambda x, rng: log_density(x), population=population)
+    proposal = Proposal(np.zeros(2), log_density(np.zeros(2)), np.eye(2))
+    of_chain, of_populations = (
+        estimate_in_blocks(proposal, one, n_blocks=2, n_proposals=800, rng=np.random.default_rng(7))
+        for one in (replace(posterior, population=None), posterior)
+    )
+    assert of_populations.log_evidence == of_chain.log_evidence
+    assert of_populations.se > 3 * of_chain.se
 
 
 def test_halves_have_no_population_in_common():

@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 from scipy.special import softmax
 
 from ...errors import DataMismatchError
-from ...importance import log_mean, mcse_of_chains, mcse_of_walkers
+from ...importance import log_mean, mcse_of_walkers
 from ..posterior import Posterior
 from .random_walk_proposal import Proposal
 from .whitening import Whitening
@@ -108,7 +108,8 @@ def estimate_in_blocks(
     def target(y: Array) -> Array:
         return posterior.evaluate(point + y @ chol.T, rng)
 
-    run = _thinned(proposal, posterior, n_proposals)
+    thinned = posterior.thinned(n_proposals)
+    run = _run_of(thinned, proposal)
     center = run.y.mean(axis=(0, 1))
     log_ordinate = -float(np.log(np.diag(chol)).sum())
     denominator_terms: Array | float = 0.0
@@ -122,7 +123,7 @@ def estimate_in_blocks(
         numerator, numerator_terms = _normalised(log_to_center, "draws moved to the central point")
         # Both terms come from one run, so that the error is that of their difference.
         terms = numerator_terms - denominator_terms
-        errors.append(mcse_of_chains(terms) if start == 0 else mcse_of_walkers(terms))
+        errors.append(thinned.mcse(terms) if start == 0 else mcse_of_walkers(terms))
 
         if is_last:
             constant = np.full((1, n_proposals), proposal.log_density)
@@ -169,12 +170,11 @@ def _choose_walkers(
     return rng.choice(len(fresh), size=N_WALKERS, p=softmax(log_weights))
 
 
-def _thinned(proposal: Proposal, posterior: Posterior, most: int) -> Run:
-    """Draws of the posterior, thinned evenly to about `most`, in whitened coordinates."""
-    thinned = posterior.thinned(most)
-    flat = thinned.draws.reshape(-1, len(proposal.point))
+def _run_of(posterior: Posterior, proposal: Proposal) -> Run:
+    """Draws of the posterior in whitened coordinates."""
+    flat = posterior.draws.reshape(-1, len(proposal.point))
     y = Whitening(proposal.point, proposal.chol).whitened(flat)
-    return Run(y.reshape(thinned.draws.shape), thinned.log_density)
+    return Run(y.reshape(posterior.draws.shape), posterior.log_density)
 
 
 def _walk(
