@@ -100,7 +100,8 @@ def chib_jeliazkov(
     ------
     ModelError
         If an argument is invalid, a free variable is discrete, the draws are too few, do not
-        vary or are those of `select_terms`, or chains of held noise have different seeds.
+        vary, are those of `select_terms`, or of `sample_smc` and of fewer than four populations
+        or mostly of one, or chains of held noise have different seeds.
     DataMismatchError
         If the draws lack free variables of the model, belong to another model or other data, or
         the likelihood estimates of the chain cannot be recovered.
@@ -215,7 +216,8 @@ def estimate_evidence(
         of the model.
     estimators : str, Estimator, or iterable of them, optional
         By default "chib_jeliazkov" and "bridge"; with draws of `sample_smc`, whose populations are
-        few independent ones, "importance", whose error they do not enter. Names among
+        few independent ones, "importance", whose error they do not enter: "chib_jeliazkov",
+        "bridge" and "warp_bridge" need four of them. Names among
         "chib_jeliazkov", "bridge" (bridge sampling to a normal distribution), "warp_bridge"
         (warp-III bridge sampling, for skewed posteriors), "importance" (importance sampling from a
         mixture of Student-t distributions, for several modes), "tempered_smc" (tempered sequential

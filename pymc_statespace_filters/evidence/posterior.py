@@ -28,6 +28,9 @@ from ..pymc_model.random_variable import PanelRV
 
 N_CHECKED = 16  # draws whose stored log-density is compared with a recomputed one
 N_EXPLAINED = 100  # points of zero likelihood at which the reason is looked for
+LEAST_POPULATIONS = 4  # two in each half, whose spread is its error
+LEAST_SHARE = 0.02  # of the draws, for a population to count
+LEAST_HALF = 0.25  # of the draws
 STORED_NAMES = ("lp", "logp")  # of the log-density in sample_stats, in PyMC and in nutpie
 
 Array = NDArray[np.float64]
@@ -131,13 +134,29 @@ class Posterior:
     def halves(self) -> tuple["Posterior", "Posterior"]:
         """Split every chain into its first and second half; of populations, half of these.
 
+        Each half can be averaged, with an error of its own.
+
         Raises
         ------
         ModelError
-            If all draws are of one population.
+            If fewer than four populations have a fiftieth of the draws or more, or one decides,
+            so that either half has less than a quarter of the draws.
         """
         if self.population is not None:
             return self._halves_of_populations(self.population)
+        return self._halves_of_chains()
+
+    def halves_for_fit(self) -> tuple["Posterior", "Posterior"]:
+        """Split every chain into its first and second half; of populations, every second draw.
+
+        A fit to one half is compared with the other. Nothing is averaged, so that one population
+        is enough.
+        """
+        if self.population is not None:
+            return self._at(np.s_[:, ::2]), self._at(np.s_[:, 1::2])
+        return self._halves_of_chains()
+
+    def _halves_of_chains(self) -> tuple["Posterior", "Posterior"]:
         middle = self.draws.shape[1] // 2
         return self._at(np.s_[:, :middle]), self._at(np.s_[:, middle:])
 
@@ -146,13 +165,18 @@ class Posterior:
     ) -> tuple["Posterior", "Posterior"]:
         """The populations dealt out in the order of their sizes, each half as one chain."""
         labels, sizes = np.unique(population, return_counts=True)
-        if len(labels) < 2:
-            raise ModelError(
-                "draws must be of several populations, got all of one, whose evidence is far above "
-                'that of the others: use estimators="importance", or raise draws of sample_smc'
-            )
         order = labels[np.argsort(-sizes, kind="stable")]
         is_first = np.isin(population, [*order[::4], *order[3::4]])
+        n_counting = int((sizes >= LEAST_SHARE * population.size).sum())
+        share = min(is_first.mean(), 1 - is_first.mean())
+        if n_counting < LEAST_POPULATIONS or share < LEAST_HALF:
+            raise ModelError(
+                f"the draws of idata must be of at least {LEAST_POPULATIONS} populations, none of "
+                f"which decides alone, to be averaged, got {n_counting} with {LEAST_SHARE:.0%} of "
+                f"the draws or more, and {sizes.max() / population.size:.0%} in the largest: use "
+                'estimate_evidence with estimators="importance", or raise draws or populations of '
+                "sample_smc"
+            )
         first, second = (np.nonzero(mask) for mask in (is_first, ~is_first))
         return self._at(tuple(one[None] for one in first)), self._at(
             tuple(one[None] for one in second)

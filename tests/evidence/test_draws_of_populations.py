@@ -4,6 +4,7 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import arviz as az
 import numpy as np
 import pymc as pm
 import pytest
@@ -48,21 +49,6 @@ def test_errors_are_those_of_few_independent_populations(estimator):
     assert 0.3 < np.mean(np.square(z)) < 2.0
 
 
-def test_the_error_of_blocks_is_that_of_populations():
-    """Populations of different widths in turn, which in chains would cancel."""
-    population = np.broadcast_to(np.arange(800) % 4, (1, 800))
-    widths = np.array([0.5, 0.8, 1.1, 1.4])[population]
-    x = widths[..., None] * np.random.default_rng(6).standard_normal((1, 800, 2))
-    posterior = Posterior(x, log_density(x), lambda x, rng: log_density(x), population=population)
-    proposal = Proposal(np.zeros(2), log_density(np.zeros(2)), np.eye(2))
-    of_chain, of_populations = (
-        estimate_in_blocks(proposal, one, n_blocks=2, n_proposals=800, rng=np.random.default_rng(7))
-        for one in (replace(posterior, population=None), posterior)
-    )
-    assert of_populations.log_evidence == of_chain.log_evidence
-    assert of_populations.se > 3 * of_chain.se
-
-
 def test_halves_have_no_population_in_common():
     posterior = particles(np.random.default_rng(1))
     halves = posterior.halves()
@@ -78,23 +64,100 @@ def test_halves_have_no_population_in_common():
     assert thinned.population.shape == thinned.log_density.shape == (4, 20)
 
 
-def test_draws_of_one_population_have_no_error():
-    posterior = particles(np.random.default_rng(1))
-    alone = Posterior(
-        posterior.draws,
-        posterior.log_density,
-        posterior.evaluate,
-        population=np.zeros_like(posterior.population),
+def test_the_error_of_blocks_is_that_of_populations():
+    """Populations of different widths in turn, which in chains would cancel."""
+    population = np.broadcast_to(np.arange(800) % 4, (1, 800))
+    widths = np.array([0.5, 0.8, 1.1, 1.4])[population]
+    x = widths[..., None] * np.random.default_rng(6).standard_normal((1, 800, 2))
+    posterior = Posterior(x, log_density(x), lambda x, rng: log_density(x), population=population)
+    proposal = Proposal(np.zeros(2), log_density(np.zeros(2)), np.eye(2))
+    of_chain, of_populations = (
+        estimate_in_blocks(proposal, one, n_blocks=2, n_proposals=800, rng=np.random.default_rng(7))
+        for one in (replace(posterior, population=None), posterior)
     )
+    assert of_populations.log_evidence == of_chain.log_evidence
+    assert of_populations.se > 3 * of_chain.se
+
+
+def of_sizes(sizes):
+    """Independent draws of N(0, 1) in 4 chains, of populations of given sizes, of sum 800."""
+    x = np.random.default_rng(4).standard_normal((4, 200, 2))
+    population = np.repeat(np.arange(len(sizes)), sizes).reshape(4, 200)
+    return Posterior(x, log_density(x), lambda x, rng: log_density(x), population=population)
+
+
+def test_draws_of_one_population_have_no_error():
+    alone = of_sizes([800])
     assert np.isinf(alone.mcse(alone.log_density))
-    with pytest.raises(ModelError, match="got all of one"):
-        Bridge().estimate(alone, rng=np.random.default_rng(1))
 
 
-def test_the_error_of_a_mean_is_that_of_unequal_clusters():
-    terms, population = np.array([1.0, 3.0, 5.0, 5.0]), np.array([0, 0, 1, 1])
-    expected = np.sqrt(2 * (0.25 * 1.5**2 * 2)) * 12.706 / 1.96
-    assert mcse_of_populations(terms, population) == pytest.approx(expected, rel=1e-3)
+def test_halves_for_a_fit_are_of_all_populations():
+    posterior = particles(np.random.default_rng(1))
+    for half in posterior.halves_for_fit():
+        assert half.draws.shape == (4, 100, 2)
+        assert set(np.unique(half.population)) == set(range(R))
+    chains = replace(posterior, population=None)
+    for one, other in zip(chains.halves_for_fit(), chains.halves(), strict=True):
+        np.testing.assert_array_equal(one.draws, other.draws)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "found"),
+    [
+        ([400, 380, 20], "got 3 with 2% of the draws or more, and 50% in the largest"),
+        ([400, 380, 16, 4], "got 3 with 2% of the draws or more"),
+        ([720, 20, 20, 20, 20], "got 5 with 2% of the draws or more, and 90% in the largest"),
+    ],
+)
+@pytest.mark.parametrize("estimator", [Bridge(), Bridge(warped=True), ChibJeliazkov()])
+def test_few_populations_are_not_averaged(estimator, sizes, found):
+    with pytest.raises(ModelError, match=found):
+        estimator.estimate(of_sizes(sizes), rng=np.random.default_rng(1))
+
+
+@pytest.mark.parametrize("sizes", [[400, 360, 20, 20], [500, 140, 80, 80]])
+@pytest.mark.parametrize(
+    "estimator",
+    [
+        Bridge(target_se=0.05),
+        Bridge(True, 0.05),
+        ChibJeliazkov(target_se=0.05),
+        ChibJeliazkov(100, n_blocks=2),
+    ],
+)
+def test_four_unequal_populations_are(estimator, sizes):
+    found = estimator.estimate(of_sizes(sizes), rng=np.random.default_rng(5))
+    assert abs(found.log_evidence) < 4 * found.se < np.inf
+
+
+class TestModel:
+    """Draws from the posterior of one normal mean, labelled as those of `sample_smc`."""
+
+    @pytest.fixture
+    def model(self):
+        with pm.Model() as model:
+            pm.Normal("y", pm.Normal("mu", 0, 2), 1, observed=[0.3, -0.4, 1.1])
+        return model
+
+    @staticmethod
+    def idata(n_populations):
+        mu = 4 / 13 + np.random.default_rng(1).standard_normal((4, 200)) / np.sqrt(3.25)
+        population = np.arange(800).reshape(4, 200) * n_populations // 800
+        tree = az.from_dict({"posterior": {"mu": mu}, "sample_stats": {"population": population}})
+        tree.attrs["sampler"] = BY_PARTICLES
+        return tree
+
+    def test_one_population_is_enough_for_importance_sampling(self, model):
+        found = estimation.estimate_evidence(self.idata(1), model, random_seed=1)["importance"]
+        assert abs(found.log_evidence - (-4.6154)) < 4 * found.se < 0.2
+
+    @pytest.mark.parametrize("n_populations", [1, 2, 3])
+    def test_others_refuse_fewer_than_four(self, model, n_populations):
+        idata, advice = self.idata(n_populations), 'estimate_evidence with estimators="importance"'
+        with pytest.raises(ModelError, match=f"got {n_populations} with .*{advice}"):
+            estimation.estimate_evidence(idata, model, estimators="bridge")
+        with pytest.raises(ModelError, match=f"got {n_populations} with .*{advice}"):
+            estimation.chib_jeliazkov(idata, model)
 
 
 def test_importing_posteriors_leaves_the_statistics_of_arviz_alone():
@@ -104,6 +167,12 @@ def test_importing_posteriors_leaves_the_statistics_of_arviz_alone():
         "sys.exit('arviz_stats' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", script], timeout=120, check=False).returncode == 0
+
+
+def test_the_error_of_a_mean_is_that_of_unequal_clusters():
+    terms, population = np.array([1.0, 3.0, 5.0, 5.0]), np.array([0, 0, 1, 1])
+    expected = np.sqrt(2 * (0.25 * 1.5**2 * 2)) * 12.706 / 1.96
+    assert mcse_of_populations(terms, population) == pytest.approx(expected, rel=1e-3)
 
 
 def test_populations_are_read_from_the_result():

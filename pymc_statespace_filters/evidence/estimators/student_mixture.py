@@ -26,8 +26,8 @@ Array = NDArray[np.float64]
 def choose_mixture(posterior: Posterior, rng: np.random.Generator) -> StudentMixture:
     """Fit the mixture of the largest predicted effective sample size to the draws.
 
-    Components are added to a fit of the first half of every chain as long as this lowers the second
-    moment of the weights w = p / q on the second half: E_q[w^2] = E_p[w].
+    Components are added to a fit of one half of the draws (`Posterior.halves_for_fit`) as long as
+    this lowers the second moment of the weights w = p / q on the other half: E_q[w^2] = E_p[w].
 
     Raises
     ------
@@ -35,7 +35,7 @@ def choose_mixture(posterior: Posterior, rng: np.random.Generator) -> StudentMix
         If the draws do not vary in every direction.
     """
     mean, chol = coordinates = moments(posterior.draws)
-    halves = [half.thinned(MOST_FITTED // 2) for half in posterior.halves()]
+    halves = [half.thinned(MOST_FITTED // 2) for half in posterior.halves_for_fit()]
     first, second = (coordinates.whitened(half.draws.reshape(-1, len(mean))) for half in halves)
     best, n_best, least = place_components(first, 1, rng), 0, np.inf
     for n_components in range(1, MOST_COMPONENTS + 1):

@@ -101,7 +101,7 @@ class NormalProposals:
 def normal_proposals(
     posterior: Posterior, rng: np.random.Generator
 ) -> tuple[NormalProposals, NormalProposals]:
-    """Proposals fitted to the first and to the second half of every chain.
+    """Proposals fitted to each of the halves that are averaged (`Posterior.halves`).
 
     They are those of all estimators that run on this posterior, if it has a seed for them;
     otherwise new ones of `rng`.
