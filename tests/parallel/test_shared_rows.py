@@ -67,8 +67,5 @@ def test_what_outlasts_interrupts_is_evaluated_by_all_ranks_to_its_end():
 
 
 def test_without_ranks_an_interrupt_ends_it():
-    reached = []
     with outlasting_interrupts():
-        signal.raise_signal(signal.SIGINT)
-        reached.append("end")
-    assert not reached
+        raise KeyboardInterrupt
