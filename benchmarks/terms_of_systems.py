@@ -22,6 +22,9 @@ by bridge sampling and importance sampling of long chains. Eight runs from one s
 the first one with the root mean square error 0.016, at a stated one of 0.008; seven of them warned
 of heavy tails or of few effective points.
 
+``double_well``, record 1: all eight terms have probabilities of 0.59 to 0.68 by `GridFilter`, and
+`BootstrapPF` differs by 0.008 at most, mean z^2 1.3; 60 CPU s, and 767 by the grid.
+
 ``neuron``, records 2 to 5: the four terms of the first equation have probability 1.00, its false
 ones 0.20 at most. Coefficients of the second one are 0.06 to 0.08, where the slab has the standard
 deviation 1: they are found in none of the four, and ``b[v^3]`` takes their place in all. Mean z^2
