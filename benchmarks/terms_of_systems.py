@@ -28,7 +28,9 @@ of heavy tails or of few effective points.
 ``neuron``, records 2 to 5: the four terms of the first equation have probability 1.00, its false
 ones 0.20 at most. Coefficients of the second one are 0.06 to 0.08, where the slab has the standard
 deviation 1: they are found in none of the four, and ``b[v^3]`` takes their place in all. Mean z^2
-0.05, so that errors of chains that mix slowly are too wide; 93 CPU s, 202 at most.
+0.05, so that errors of chains that mix slowly are too wide; 93 CPU s, 202 at most. ``neuron_v``,
+record 1: two seeds do not agree, and both warn that the draws of the full model, which hardly mix,
+are worth four.
 """
 
 import logging
