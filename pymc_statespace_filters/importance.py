@@ -48,6 +48,17 @@ def log_mean(log_terms: Array) -> float:
     return float(peak + np.log(np.exp(log_terms - peak).mean())) if peak > -np.inf else -np.inf
 
 
+def mcse(terms: Array, population: NDArray[np.int64] | None = None) -> float:
+    """Standard error of the mean of terms (chain, draw), one of each draw of a posterior.
+
+    ``population`` (chain, draw) has that of each draw, if they are particles: the draws of one have
+    common ancestors, so that only populations are independent.
+    """
+    if population is None:
+        return mcse_of_chains(terms)
+    return mcse_of_populations(terms, population)
+
+
 def mcse_of_chains(terms: Array) -> float:
     """Standard error of the mean of autocorrelated terms, shape (chain, draw).
 
@@ -56,13 +67,15 @@ def mcse_of_chains(terms: Array) -> float:
     for a mean is their standard deviation over the root of their number, by as much wider as
     Student's interval of so few chains is wider than the normal one.
     """
-    from arviz_stats import mcse
+    import arviz_stats
 
-    pooled, n_chains = float(mcse(terms, method="mean")), len(terms)
+    pooled, n_chains = float(arviz_stats.mcse(terms, method="mean")), len(terms)
     if n_chains < 2:
         return pooled
     between = float(terms.mean(axis=1).std(ddof=1)) / math.sqrt(n_chains)
-    within = math.hypot(*(float(mcse(one[None], method="mean")) for one in terms)) / n_chains
+    within = (
+        math.hypot(*(float(arviz_stats.mcse(one[None], method="mean")) for one in terms)) / n_chains
+    )
     if (n_chains - 1) * between**2 <= chdtri(n_chains - 1, 1 - AGREE) * within**2:
         return pooled
     return max(pooled, between * student_factor(n_chains))
@@ -114,10 +127,10 @@ def mcse_of_walkers(terms: Array) -> float:
     return float(terms.mean(axis=1).std(ddof=1) / len(terms) ** 0.5)
 
 
-def log_mean_of_chains(log_terms: Array) -> LogMean:
-    """Average autocorrelated terms, shape (chain, draw)."""
+def log_mean_of_draws(log_terms: Array, population: NDArray[np.int64] | None = None) -> LogMean:
+    """Average terms (chain, draw), one of each draw of a posterior, with the error of `mcse`."""
     value = log_mean(log_terms)
-    return LogMean(value, mcse_of_chains(np.exp(log_terms - value)))
+    return LogMean(value, mcse(np.exp(log_terms - value), population))
 
 
 def log_mean_of_independent(log_terms: Array) -> LogMean:

@@ -1,4 +1,4 @@
-r"""Draws of a chain and independent points as one sample, from a mixture of their two laws.
+r"""Draws of a posterior and independent points as one sample, from a mixture of their two laws.
 
 A chain has drawn n_1 points from an approximate posterior :math:`p_a(x) = a(x) / Z_a` of unknown
 evidence :math:`Z_a`, and n_2 points come from a normalised density q. All of them together are a
@@ -17,8 +17,8 @@ points of q (Shirts and Chodera 2008).
 
 The errors follow from how each point moves the two equations: with :math:`D = \sum h (1 - h)`, a
 draw moves :math:`\ln Z_a` by :math:`-h / D` and a point of q by :math:`(1 - h) / D`. The variance
-of the sum of these influences is that of independent points for q, and that of an autocorrelated
-chain for the draws.
+of the sum of these influences is that of independent points for q; for the draws, that of
+autocorrelated chains or of independent populations (`mcse`).
 
 Where a or t is a noisy estimate, x stands for a point with its noise: the draws have the estimates
 stored by the chain, the points of q fresh ones, and t has fresh noise everywhere.
@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from ..importance import LogMean, bridge_constant, log_mean, mcse_of_chains, normalised
+from ..importance import LogMean, bridge_constant, log_mean, mcse, normalised
 
 Array = NDArray[np.float64]
 
@@ -47,12 +47,15 @@ class Pooled:
         Chains and draws; n in all are followed by the m points of q.
     log_target, log_approximate, log_q : ndarray (n + m,)
         The logs of t, a and q at all of them.
+    population : ndarray of int (chain, draw), optional
+        As in `Posterior`.
     """
 
     shape: tuple[int, int]
     log_target: Array
     log_approximate: Array
     log_q: Array
+    population: NDArray[np.int64] | None = None
 
     @property
     def n_draws(self) -> int:
@@ -120,6 +123,6 @@ class Pooled:
         h, n = self.share_of_q, self.n_draws
         moves = np.concatenate([-h[:n], 1 - h[n:]]) / (h @ (1 - h))
         influence = terms + by_constant * moves
-        of_draws = n * mcse_of_chains(influence[:n].reshape(self.shape))
+        of_draws = n * mcse(influence[:n].reshape(self.shape), self.population)
         of_points = math.sqrt(h.size - n) * float(influence[n:].std())
         return math.hypot(of_draws, of_points)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..errors import DataMismatchError, ModelError
 from ..filters.outcomes import Failure, why_zero
-from ..importance import LogMean, log_mean, mcse_of_chains, mcse_of_populations
+from ..importance import LogMean, log_mean_of_draws, mcse
 from ..pymc_model.aligned_axes import records_of_rows
 from ..pymc_model.density import ModelDensity
 from ..pymc_model.filter_estimates import failures_at
@@ -108,9 +108,7 @@ class Posterior:
 
     def mcse(self, terms: Array) -> float:
         """Standard error of the mean of terms (chain, draw), one of each draw."""
-        if self.population is None:
-            return mcse_of_chains(terms)
-        return mcse_of_populations(terms, self.population)
+        return mcse(terms, self.population)
 
     def ess(self, terms: Array) -> float:
         """How many independent draws the mean of terms (chain, draw) is worth, at least one."""
@@ -123,8 +121,7 @@ class Posterior:
 
     def log_mean(self, log_terms: Array) -> LogMean:
         """Log of the mean of positive terms (chain, draw), one of each draw, with its error."""
-        value = log_mean(log_terms)
-        return LogMean(value, self.mcse(np.exp(log_terms - value)))
+        return log_mean_of_draws(log_terms, self.population)
 
     def why_zero(self, x: Array) -> str:
         """Why the likelihood is zero at most of some prior draws x (m, k), and what to do."""
@@ -153,12 +150,12 @@ class Posterior:
         is enough.
         """
         if self.population is not None:
-            return self._at(np.s_[:, ::2]), self._at(np.s_[:, 1::2])
+            return self.at(np.s_[:, ::2]), self.at(np.s_[:, 1::2])
         return self._halves_of_chains()
 
     def _halves_of_chains(self) -> tuple["Posterior", "Posterior"]:
         middle = self.draws.shape[1] // 2
-        return self._at(np.s_[:, :middle]), self._at(np.s_[:, middle:])
+        return self.at(np.s_[:, :middle]), self.at(np.s_[:, middle:])
 
     def _halves_of_populations(
         self, population: NDArray[np.int64]
@@ -178,7 +175,7 @@ class Posterior:
                 "sample_smc"
             )
         first, second = (np.nonzero(mask) for mask in (is_first, ~is_first))
-        return self._at(tuple(one[None] for one in first)), self._at(
+        return self.at(tuple(one[None] for one in first)), self.at(
             tuple(one[None] for one in second)
         )
 
@@ -188,9 +185,9 @@ class Posterior:
 
     def every(self, step: int) -> "Posterior":
         """One of so many draws of every chain."""
-        return self._at(np.s_[:, ::step])
+        return self.at(np.s_[:, ::step])
 
-    def _at(self, index: Any) -> "Posterior":
+    def at(self, index: Any) -> "Posterior":
         """The draws at an index of the axes chain and draw."""
         population = None if self.population is None else self.population[index]
         return replace(

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -11,11 +12,11 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from ..errors import EvidenceWarning
-from ..importance import MAX_PARETO_K, MIN_EFFECTIVE, mcse_of_chains, pareto_k
+from ..importance import MAX_PARETO_K, MIN_EFFECTIVE, mcse, pareto_k
 from ..progress import row_progress
 from ..pymc_model.density import RowFunction, check_free_variables
 from ..pymc_model.inspection import given_model
-from ..pymc_model.posterior_draws import MIN_DRAWS, unconstrained_draws
+from ..pymc_model.posterior_draws import MIN_DRAWS, populations_of, unconstrained_draws
 from ..pymc_model.step_refinement import densities_by_halvings, step_lengths
 from ..system.checks import check_count, check_random_seed
 
@@ -131,13 +132,17 @@ def step_error(
     draws = unconstrained_draws(idata, model)
     n_chains, length = draws.shape[:2]
     each = min(length, max(1, n_draws // n_chains))
-    draws = draws[:, np.linspace(0, length - 1, each).round().astype(int)]
+    rows = np.linspace(0, length - 1, each).round().astype(int)
+    draws, population = draws[:, rows], populations_of(idata)
+    if population is not None:
+        population = population[:, rows]
     functions = [RowFunction(model, graph) for graph in densities_by_halvings(model, halvings)]
     coarse, *finer = _at_draws(functions, draws, rng, progressbar)
-    rows = [_changes(fine, coarse, draws.shape[:2], jackknife=True) for fine in finer]
+    row_of = partial(_changes, coarse=coarse, shape=draws.shape[:2], population=population)
+    found = [row_of(fine, jackknife=True) for fine in finer]
     lengths = max(step_lengths(model)) * 0.5 ** np.arange(1, halvings + 1)
-    table = pd.DataFrame(rows, index=pd.Index(lengths, name="dt"))
-    plain = [_changes(fine, coarse, draws.shape[:2], jackknife=False) for fine in finer]
+    table = pd.DataFrame(found, index=pd.Index(lengths, name="dt"))
+    plain = [row_of(fine, jackknife=False) for fine in finer]
     corrections = np.abs(table - pd.DataFrame(plain, index=table.index))["log_evidence_change"]
     _warn_of_failures(finer, coarse)
     for (dt, row), fine, correction in zip(table.iterrows(), finer, corrections, strict=True):
@@ -169,7 +174,12 @@ def _at_draws(
 
 
 def _changes(
-    fine: Array, coarse: Array, shape: tuple[int, int], *, jackknife: bool
+    fine: Array,
+    coarse: Array,
+    shape: tuple[int, int],
+    population: NDArray[np.int64] | None,
+    *,
+    jackknife: bool,
 ) -> dict[str, float]:
     """A row of the table from log-densities (draws, seeds); ``shape`` is (chains, draws)."""
     usable = np.isfinite(coarse).any(axis=1)  # the others are no draws of the posterior
@@ -187,9 +197,9 @@ def _changes(
         weight = _jackknifed(ratio, fine, coarse, weight)
     change = np.where(np.isfinite(change), change, np.nan).reshape(shape)
     weight, mean = weight.reshape(shape), float(np.nanmean(weight))
-    numbers = [np.nanmean(change), _standard_error(change), np.nan, np.nan]
+    numbers = [np.nanmean(change), _standard_error(change, population), np.nan, np.nan]
     if mean > 0:  # not where the corrections of large noise outweigh the ratios
-        numbers[2:] = np.log(mean) + peak, _standard_error(weight) / mean
+        numbers[2:] = np.log(mean) + peak, _standard_error(weight, population) / mean
     return dict(zip(COLUMNS, map(float, numbers), strict=True))
 
 
@@ -213,13 +223,13 @@ def _jackknifed(
     return np.where(np.isfinite(parts), corrected, whole)
 
 
-def _standard_error(values: Array) -> float:
+def _standard_error(values: Array, population: NDArray[np.int64] | None) -> float:
     """Of the mean of correlated values (chain, draw), those that are NaN left out."""
     known = np.isfinite(values)
     filled = np.where(known, values, np.nanmean(values))
     if np.ptp(filled) == 0.0:  # such as by an integrator that is exact
         return 0.0
-    return mcse_of_chains(filled) / known.mean() ** 0.5
+    return mcse(filled, population) / known.mean() ** 0.5
 
 
 def _warn_of_failures(finer: list[Array], coarse: Array) -> None:

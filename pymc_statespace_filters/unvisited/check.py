@@ -30,7 +30,7 @@ from scipy.special import log_expit, stdtrit
 from ..importance import (
     LogMean,
     bridge_constant,
-    log_mean_of_chains,
+    log_mean_of_draws,
     log_mean_of_independent,
     log_mean_of_truncated,
     mcse_of_chains,
@@ -178,7 +178,7 @@ def _bridged(
         return None
     at_drawn = at_drawn - log_normal(drawn)
     value = bridge_constant(at_drawn, at_x, 0.0)  # a rough one, of equal numbers
-    of_draws = log_mean_of_chains(log_expit(value - at_drawn)).error
+    of_draws = log_mean_of_draws(log_expit(value - at_drawn)).error
     of_points = log_mean_of_independent(log_expit(at_x - value)).error
     return LogMean(value, math.hypot(of_draws, of_points))
 

@@ -19,9 +19,8 @@ truncated. The place is named if :math:`p_A` exceeds s by more than 3 errors and
 The same comparison is made at the narrowest component of the mixture, which particles have met, but
 perhaps too few.
 
-With 200 draws this marks 11 of 14 runs of `benchmarks.smc` that have lost a needle, and none of 49
-on needle and wells whose masses are within 3 errors. On more targets 2 of 113 were marked, when the
-mixture was fitted to copies of the particles.
+In `benchmarks.smc` this marks 11 of 14 runs that have lost a needle with 200 draws, and all of 6
+with 1000. Of runs whose masses are within 3 errors, on all targets, it marks 2 of 113 and 0 of 119.
 """
 
 import math

@@ -12,7 +12,7 @@ from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import (
     estimate_in_one_block,
 )
 from pymc_statespace_filters.evidence.estimators.random_walk_proposal import plan_proposal
-from pymc_statespace_filters.importance import log_mean_of_chains, log_mean_of_independent
+from pymc_statespace_filters.importance import log_mean_of_draws, log_mean_of_independent
 from tests.evidence.analytic import Regression, gaussian, half_normal, pilot
 from tests.evidence.calibration import EACH_NUMBER_OF_RUNS, check_scores
 
@@ -154,7 +154,7 @@ class TestNoisyLikelihood:
             posterior, pilot(posterior), n_proposals=10_000, most=10_000, rng=rng
         ).proposal
         other = replace(one, log_density=one.log_density + 1.0)
-        numerator = log_mean_of_chains(
+        numerator = log_mean_of_draws(
             other.log_alpha_to_center(posterior.log_density) + other.log_q(posterior.draws)
         )
         denominator = log_mean_of_independent(

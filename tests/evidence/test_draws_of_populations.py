@@ -13,13 +13,19 @@ from scipy.stats import norm
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence import estimation, runner
+from pymc_statespace_filters.evidence.comparison.scaled_prior import average_ratios
 from pymc_statespace_filters.evidence.estimators.block_ordinates import estimate_in_blocks
 from pymc_statespace_filters.evidence.estimators.bridge import Bridge
 from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
+from pymc_statespace_filters.evidence.estimators.laplace import Laplace
 from pymc_statespace_filters.evidence.estimators.random_walk_proposal import Proposal
+from pymc_statespace_filters.evidence.pooled import Pooled
 from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.evidence.reweighting.correction import correct
+from pymc_statespace_filters.evidence.shorter_steps import _changes
 from pymc_statespace_filters.importance import mcse_of_populations
 from pymc_statespace_filters.pymc_model.posterior_draws import BY_PARTICLES, populations_of
+from tests.evidence.targets import Regression
 
 R, N, SCATTER = 8, 100, 0.4
 
@@ -77,6 +83,69 @@ def test_the_error_of_blocks_is_that_of_populations():
     )
     assert of_populations.log_evidence == of_chain.log_evidence
     assert of_populations.se > 3 * of_chain.se
+
+
+def in_turn(scatter):
+    """A term of each draw, 4 populations in turn along one chain, whose means cancel there."""
+    population = np.broadcast_to(np.arange(800) % 4, (1, 800))
+    terms = np.random.default_rng(2).standard_normal((1, 800))
+    return terms + scatter * np.array([-1.5, -0.5, 0.5, 1.5])[population], population
+
+
+def of_step_error(terms, population):
+    coarse = np.zeros((terms.size, 1))
+    found = _changes(0.01 * terms.reshape(-1, 1), coarse, terms.shape, population, jackknife=False)
+    return [found["log_lik_se"], found["log_evidence_se"]]
+
+
+def of_scaled_priors(terms, population):
+    return [average_ratios(0.1 * terms, np.zeros(terms.shape), population).error]
+
+
+def of_weights(terms, population):
+    """Points of the target itself beside the draws, so that the constants cost nothing."""
+    logs = np.append(0.1 * terms.ravel(), np.zeros(200))
+    pooled = Pooled(terms.shape, logs, np.zeros(1000), np.zeros(1000), population)
+    return [pooled.log_evidence().error, pooled.effective_size(logs[:, None]) ** -0.5]
+
+
+@pytest.mark.parametrize("errors_of", [of_step_error, of_scaled_priors, of_weights])
+def test_errors_of_populations_whose_draws_alternate(errors_of):
+    """As chains they look like 800 independent draws, or better; they are worth four."""
+    terms, population = in_turn(0.6)
+    as_chains, as_populations = errors_of(terms, None), errors_of(terms, population)
+    assert (np.divide(as_populations, as_chains) > 10).all()
+
+
+def test_weighted_draws_keep_their_populations():
+    target = Regression(2, 8, np.random.default_rng(1))
+    posterior = target.posterior((4, 200), np.random.default_rng(2))
+    population = np.arange(800).reshape(4, 200) // 100
+    posterior = replace(posterior, population=population)
+    kept = posterior.at(np.s_[:, ::2])
+
+    def evaluate(x, seeds):
+        return posterior.evaluate(x, np.random.default_rng(1))[:, None]
+
+    found = correct(posterior, kept, evaluate, 0, np.random.default_rng(3))
+    np.testing.assert_array_equal(found.pooled.population, population[:, ::2])
+    assert found.pooled.shape == (4, 100)
+
+
+@pytest.mark.parametrize("is_labelled", [False, True])
+def test_the_depth_of_populations_has_their_error(is_labelled):
+    """Populations of several widths, in turn, are too deep on average for draws of chains."""
+    population = np.broadcast_to(np.arange(800) % 4, (1, 800))
+    widths = np.array([0.7, 1.0, 1.4, 1.9])[population]
+    x = widths[..., None] * np.random.default_rng(6).standard_normal((1, 800, 2))
+    posterior = Posterior(
+        x,
+        log_density(x),
+        lambda x, rng: log_density(x),
+        population=population if is_labelled else None,
+    )
+    doubts = Laplace().estimate(posterior, rng=np.random.default_rng(1)).doubts
+    assert any("nats below the mode" in one for one in doubts) is not is_labelled
 
 
 def of_sizes(sizes):

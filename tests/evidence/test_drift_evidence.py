@@ -19,7 +19,7 @@ from pymc_statespace_filters.evidence.drift.marginal import ConstantModel, fit_c
 from pymc_statespace_filters.evidence.drift.strengths import StrengthsAtPoints
 from pymc_statespace_filters.evidence.drift.widths import bayes_factor_by_width
 from pymc_statespace_filters.evidence.posterior import build_posterior, reproducing_seeds
-from pymc_statespace_filters.importance import LogMean, log_mean_of_chains
+from pymc_statespace_filters.importance import LogMean, log_mean_of_draws
 from pymc_statespace_filters.pymc_model.density import ModelDensity
 from tests.systems import wandering_mean
 
@@ -142,10 +142,12 @@ def test_widths_are_those_of_quadrature():
 def test_errors_that_both_means_share_cancel_in_the_curve():
     """If the terms are the ratios of a width, the factor there is one without an error."""
     model, observed = drifting_model(0.0, 1)
-    posterior = exact_draws(observed, *PRIORS["half-normal"])["posterior"].to_dataset()
-    ratios, _ = ScaledPrior(model, ("mu_strength",)).log_ratios(posterior, 0.5)
+    idata = exact_draws(observed, *PRIORS["half-normal"])
+    ratios, _ = ScaledPrior(model, ("mu_strength",)).log_ratios(
+        idata["posterior"].to_dataset(), 0.5
+    )
     found = bayes_factor_by_width(
-        model, posterior, {("mu_strength",): ratios}, np.array([0.5, 1.0]), np.log([0.5] * 2), 0.95
+        model, idata, {("mu_strength",): ratios}, np.array([0.5, 1.0]), np.log([0.5] * 2), 0.95
     )
     for name in ("width_log_bayes_factor", "width_se"):
         assert abs(found[name].values[0, 0]) < 1e-12 < abs(found[name].values[0, 1])
@@ -162,7 +164,7 @@ def test_without_seeds_the_numerator_has_fresh_noise():
     model, observed = drifting_model(0.0, 1, psf.BootstrapPF(16))
     posterior, _ = build_posterior(noisy_chains(), ModelDensity(model))
     constant = ConstantModel(model, ["mu_strength"], moved=False)
-    mean = log_mean_of_chains(constant.log_terms(posterior, None, np.random.default_rng(1)))
+    mean = log_mean_of_draws(constant.log_terms(posterior, None, np.random.default_rng(1)))
     assert mean.error < 0.15
     assert abs(-mean.value - exact_log_bayes_factor(observed)) < 3.5 * mean.error
 

@@ -17,6 +17,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.lowering.symbols import symbols_of
 from pymc_statespace_filters.errors import FilterWarning, ModelError
+from pymc_statespace_filters.filters.regimes import backward_simulation
 from pymc_statespace_filters.filters.regimes.draws import draws_of
 from pymc_statespace_filters.filters.regimes.hybrid import hybrid_of
 from pymc_statespace_filters.filters.regimes.moments import _row_of_cov, draw_of_mixture
@@ -650,6 +651,10 @@ def test_smoothed_states_are_those_of_all_paths(filter, tolerance, draws):
     assert all_steps["d_states"].attrs["smoothing"] == "backward simulation"
     for name in at_data.data_vars:
         assert np.array_equal(at_data[name], all_steps[name].isel(d_time=STEPS))
+
+
+def test_parts_of_the_mixture_that_paths_share_count_once():
+    assert backward_simulation._n_distinct.py_func(np.array([3, 1, 3, 0, 3]), 5) == 3
 
 
 def check_smoothed(found, mean, cov, probability, tolerance):

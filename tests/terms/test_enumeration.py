@@ -91,3 +91,64 @@ def test_a_candidate_is_named_by_its_own_label():
     candidates = read_candidates(model, {"b": 0.0})
     assert candidates.labels == ["b[1]", "b[2]"]
     assert candidates.numbers("b[1]", "inclusion") == [0]
+
+
+class Scripted:
+    """A sampler whose points have given log weights, one list for each time they are drawn."""
+
+    is_noisy = False
+
+    def __init__(self, *times):
+        self.times = iter(times)
+
+    def draw(self, proposals, counts):
+        return [weighted(weights) for weights in next(self.times)]
+
+
+def weighted(log_weights):
+    n = len(log_weights)
+    return Weighted(Unchanged(), np.zeros((n, 1)), np.empty((n, 0), int), np.array(log_weights))
+
+
+class Unchanged:
+    """A proposal that no points improve."""
+
+    def log_density_of_drawn(self, x):
+        return np.zeros(len(x))
+
+    def refitted(self, x, log_weights, rng):
+        return self
+
+
+def test_what_points_of_a_worse_proposal_say_does_not_put_a_sub_model_out_of_reach():
+    """The first points reach high, but are few; those of the next proposal all lie low."""
+    good, few, low = np.zeros(25), np.append(np.full(24, -300.0), -5.0), np.full(50, -50.0)
+    sampler = Scripted([good, few], [low])
+    found, within = screening.screened(
+        [Unchanged()] * 2, np.zeros(2), sampler, np.random.default_rng(1)
+    )
+    assert found[1].mean.value == -50.0
+    assert within.tolist() == [True, True]
+
+
+def test_a_heavy_tail_is_looked_into_where_the_influence_looks_small(monkeypatch):
+    """A sub-model may matter ten times as much as its points with a heavy tail say."""
+    asked = []
+
+    def improved(proposals, *rest):
+        asked.extend(proposals)
+        return [weighted(heavy)] * len(proposals)
+
+    monkeypatch.setattr(enumeration, "improved", improved)
+    sets, rng = np.array([[False], [True], [True], [True]]), np.random.default_rng(1)
+    heavy = rng.pareto(0.8, 400)
+    heavy = np.log(heavy / heavy.mean())
+    assert not weighted(heavy).is_reliable
+    of_models = [np.zeros(400), np.zeros(400), heavy - 5.5, heavy - 9.0]
+    found = [weighted(one) for one in of_models]
+    known = enumeration.probabilities(found, sets, np.zeros(4))
+    assert enumeration.LARGE > known.influence()[2] > enumeration.HIDDEN * enumeration.LARGE
+    assert known.influence()[3] < enumeration.HIDDEN * enumeration.LARGE
+    sampler = Scripted([])
+    enumeration._with_lighter_tails(found, sets, np.zeros(4), sampler, rng, lambda *args: None)
+    assert asked == [found[2].proposal]

@@ -200,7 +200,7 @@ def _width_curves(
         unconstrained_draws(idatas[name], models[name])
     return width_curves(
         models,
-        {name: idatas[name]["posterior"].to_dataset() for name in names},
+        {name: idatas[name] for name in names},
         {name: [one for one in free[name] if not chosen or one in chosen] for name in names},
         widths.tolist(),
         may_leave_out=not chosen,

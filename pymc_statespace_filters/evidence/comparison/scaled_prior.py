@@ -31,7 +31,8 @@ from pytensor.tensor.variable import TensorVariable
 
 from ...compiler.native.rows import at_points
 from ...errors import ModelError
-from ...importance import MIN_EFFECTIVE, SAME, log_mean_of_chains, pareto_k
+from ...importance import MIN_EFFECTIVE, SAME, log_mean_of_draws, pareto_k
+from ...pymc_model.posterior_draws import populations_of
 from ...pymc_model.prior import can_sample
 
 EDGE = 0.05  # fraction of a bounded support, at each end
@@ -91,9 +92,17 @@ class ScaledPrior:
             [width, *points], at_draws, on_unused_input="ignore", mode="FAST_COMPILE"
         )
 
-    def reweighted(self, posterior: xr.Dataset, width: float) -> ReweightedEvidence:
-        """Compute the evidence under priors scaled by ``width``, from draws of all variables."""
-        return average_ratios(*self.log_ratios(posterior, width))
+    def reweighted(
+        self,
+        posterior: xr.Dataset,
+        width: float,
+        population: NDArray[np.int64] | None = None,
+    ) -> ReweightedEvidence:
+        """The evidence under priors scaled by ``width``, from draws of all variables.
+
+        ``population`` (chain, draw) is as in `mcse`.
+        """
+        return average_ratios(*self.log_ratios(posterior, width), population)
 
     def log_ratios(self, posterior: xr.Dataset, width: float) -> tuple[Array, Array]:
         """Log-ratios p_w / p of draws (chain, draw), and their `_beyond`."""
@@ -107,7 +116,9 @@ class ScaledPrior:
         return log_ratio.reshape(shape), beyond
 
 
-def average_ratios(log_ratio: Array, beyond: Array) -> ReweightedEvidence:
+def average_ratios(
+    log_ratio: Array, beyond: Array, population: NDArray[np.int64] | None = None
+) -> ReweightedEvidence:
     """Average the ratios p_w / p of draws (chain, draw), with diagnostics from their `_beyond`."""
     peak = log_ratio.max()
     if np.isneginf(peak):
@@ -115,7 +126,7 @@ def average_ratios(log_ratio: Array, beyond: Array) -> ReweightedEvidence:
     fraction = float(np.average(beyond.ravel(), weights=np.exp(log_ratio - peak).ravel()))
     if np.ptp(log_ratio) < SAME:  # a wider Uniform prior: all weights are equal
         return ReweightedEvidence(float(peak), 0.0, np.inf, -np.inf, fraction)
-    mean = log_mean_of_chains(log_ratio)
+    mean = log_mean_of_draws(log_ratio, population)
     return ReweightedEvidence(
         mean.value, mean.error, mean.n_effective, pareto_k(log_ratio), fraction
     )
@@ -204,7 +215,7 @@ class WidthCurves(NamedTuple):
 
 def width_curves(
     models: Mapping[str, pm.Model],
-    posteriors: Mapping[str, xr.Dataset],
+    idatas: Mapping[str, xr.DataTree],
     scaled: Mapping[str, Sequence[str]],
     widths: Sequence[float],
     *,
@@ -218,7 +229,7 @@ def width_curves(
 
     def curves(names: Mapping[str, Sequence[str]]) -> dict[str, WidthCurve]:
         return {
-            name: _width_curve(model, posteriors[name], names[name], widths)
+            name: _width_curve(model, idatas[name], names[name], widths)
             for name, model in models.items()
         }
 
@@ -256,15 +267,16 @@ def _reasons(curves: Mapping[str, WidthCurve], prior: str) -> str:
 
 
 def _width_curve(
-    model: pm.Model, posterior: xr.Dataset, names: Sequence[str], widths: Sequence[float]
+    model: pm.Model, idata: xr.DataTree, names: Sequence[str], widths: Sequence[float]
 ) -> WidthCurve:
     """One model; if most is unknown, the priors are varied one by one to find those to blame."""
+    posterior, population = idata["posterior"].to_dataset(), populations_of(idata)
 
     def curve(scaled: Sequence[str]) -> list[ReweightedEvidence]:
         if not scaled:
             return [UNCHANGED] * len(widths)
         priors = ScaledPrior(model, scaled)
-        return [priors.reweighted(posterior, width) for width in widths]
+        return [priors.reweighted(posterior, width, population) for width in widths]
 
     points = curve(names)
     if not _is_mostly_unknown(points, widths):

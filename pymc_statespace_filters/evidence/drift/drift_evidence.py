@@ -17,13 +17,13 @@ from ...importance import (
     LogMean,
     disagreement,
     largest_good_k,
-    log_mean_of_chains,
+    log_mean_of_draws,
     pareto_k,
 )
 from ...progress import row_progress
 from ...pymc_model.density import ModelDensity
 from ...pymc_model.inspection import given_model
-from ...pymc_model.posterior_draws import are_populations, noise_was_moved, posterior_group
+from ...pymc_model.posterior_draws import noise_was_moved, populations_of, posterior_group
 from ...system.checks import check_random_seed
 from ..checks import check_convergence
 from ..comparison.prior_sensitivity import width_factors
@@ -166,8 +166,12 @@ def drift_evidence(
     names = chosen_strengths(model, var_names)
     sets = [(name,) for name in names] + ([tuple(names)] if len(names) > 1 else [])
     log_terms, of_chains = _log_terms(idata, model, sets, rng, progressbar)
-    means = {one: log_mean_of_chains(terms) for one, terms in log_terms.items()}
-    doubts = {one: [*_doubts(one, terms, means[one], idata)] for one, terms in log_terms.items()}
+    population = populations_of(idata)
+    means = {one: log_mean_of_draws(terms, population) for one, terms in log_terms.items()}
+    doubts = {
+        one: [*_doubts(one, terms, means[one], population is not None)]
+        for one, terms in log_terms.items()
+    }
     table = _table(log_terms, means, doubts, prior, ci_prob)
     for name, row in table.iterrows():
         if row["doubts"]:
@@ -175,9 +179,7 @@ def drift_evidence(
     if of_chains:
         warnings.warn(f"drift: {'; '.join(of_chains)}", EvidenceWarning, stacklevel=2)
     known = {one: None if doubts[one] else terms for one, terms in log_terms.items()}
-    curves = bayes_factor_by_width(
-        model, idata["posterior"].to_dataset(), known, factors, np.log(prior), ci_prob
-    )
+    curves = bayes_factor_by_width(model, idata, known, factors, np.log(prior), ci_prob)
     others = [rv.name for rv in model.free_RVs if rv.name not in names]
     return DriftTable(table, widths=curves, sentences=[*sentences(table, others, ci_prob)])
 
@@ -205,7 +207,7 @@ def _log_terms(
 
 
 def _doubts(
-    names: tuple[str, ...], log_terms: Array, mean: LogMean, idata: xr.DataTree
+    names: tuple[str, ...], log_terms: Array, mean: LogMean, are_populations: bool
 ) -> Iterator[str]:
     """Why the mean of the terms is unknown."""
     tail = pareto_k(log_terms)
@@ -216,7 +218,7 @@ def _doubts(
             f"{mean.n_effective:.0f} effective terms): draw more, or sample "
             f"pm.do(model, {{{zeros}}}) too and compare both by psf.compare_evidence"
         )
-    elif not are_populations(idata) and (reason := disagreement(log_terms)):
+    elif not are_populations and (reason := disagreement(log_terms)):
         yield reason
 
 

@@ -11,7 +11,8 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
-from ...importance import log_mean, mcse_of_chains
+from ...importance import log_mean, mcse
+from ...pymc_model.posterior_draws import populations_of
 from ..comparison.scaled_prior import ScaledPrior, average_ratios
 from ..comparison.selection import probabilities
 
@@ -20,7 +21,7 @@ Array = NDArray[np.float64]
 
 def bayes_factor_by_width(
     model: pm.Model,
-    posterior: xr.Dataset,
+    idata: xr.DataTree,
     log_terms: Mapping[tuple[str, ...], Array | None],
     widths: Array,
     log_prior: Array,
@@ -33,6 +34,7 @@ def bayes_factor_by_width(
     is as that of `prior_sensitivity`.
     """
     names = [", ".join(strengths) for strengths in log_terms]
+    posterior, population = idata["posterior"].to_dataset(), populations_of(idata)
     factor, error = np.full((2, len(names), len(widths)), np.nan)
     for i, (strengths, terms) in enumerate(log_terms.items()):
         if terms is None:
@@ -40,10 +42,10 @@ def bayes_factor_by_width(
         scaled = ScaledPrior(model, strengths)
         for j, width in enumerate(widths):
             ratios, beyond = scaled.log_ratios(posterior, float(width))
-            if average_ratios(ratios, beyond).is_reliable:
+            if average_ratios(ratios, beyond, population).is_reliable:
                 factor[i, j] = log_mean(ratios) - log_mean(terms)
                 # Both means are of the same draws.
-                error[i, j] = mcse_of_chains(_relative(ratios) - _relative(terms))
+                error[i, j] = mcse(_relative(ratios) - _relative(terms), population)
     fields = {"log_bayes_factor": factor, "se": error}
     fields |= _probabilities(factor, error, log_prior, ci_prob)
     return xr.Dataset(

@@ -134,13 +134,10 @@ def _check(posterior: Posterior, at_mode: float, log_dets: tuple[float, float]) 
             f"the step size of the differences changes it by {effect:.2g} nats: the log-density "
             "is rugged, as with a held noise seed; use an estimator that averages over draws"
         )
-    from arviz_stats import mcse  # loads much: see `importance`
-
     # Draws of a Gaussian lie k / 2 below the mode on average; heavy tails or further modes, lower.
     depth = at_mode - posterior.log_density
     expected = 0.5 * posterior.draws.shape[-1]
-    error = float(mcse(depth, method="mean"))
-    if abs(depth.mean() - expected) > MAX_EXCESS + 3 * error:
+    if abs(depth.mean() - expected) > MAX_EXCESS + 3 * posterior.mcse(depth):
         yield (
             f"the draws lie {depth.mean():.2f} nats below the mode on average where those of a "
             f"Gaussian lie {expected:.2f}: the error may be as large as the difference; use an "

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from ...importance import mcse_of_chains
 from ...student_mixture import fit_mixture, place_components, standardised
 from ..posterior import Posterior
 from .smc_moves import Particles
@@ -56,6 +55,7 @@ def compare_with_draws(
             inside[:n_particles].reshape(n_runs, -1),
             inside[n_particles:].reshape(posterior.log_density.shape),
             n_ancestors,
+            posterior,
         )
         for inside in regions
     ]
@@ -102,7 +102,10 @@ def _regions(
 
 
 def _share(
-    of_particles: NDArray[np.bool_], of_draws: NDArray[np.bool_], n_ancestors: int
+    of_particles: NDArray[np.bool_],
+    of_draws: NDArray[np.bool_],
+    n_ancestors: int,
+    posterior: Posterior,
 ) -> _Share:
     """Compare the shares of particles (run, particle) and draws (chain, draw) in a region."""
     by_run = of_particles.mean(axis=1)
@@ -111,6 +114,7 @@ def _share(
     # Runs that all miss a region have no spread: no error is below that of independent ancestors.
     least = math.sqrt(pooled * (1 - pooled) / n_ancestors)
     of_runs = max(float(by_run.std(ddof=1)) / math.sqrt(len(by_run)), least)
-    of_chains = mcse_of_chains(of_draws.astype(np.float64)) if 0 < other < 1 else 0.0
-    error = math.hypot(of_runs, of_chains)
+    error = of_runs
+    if 0 < other < 1:
+        error = math.hypot(error, posterior.mcse(of_draws.astype(np.float64)))
     return _Share(one, other, (one - other) / error if error else 0.0)

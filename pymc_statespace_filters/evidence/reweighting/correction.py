@@ -141,7 +141,9 @@ def correct(
     for part in np.split(log_target, [len(draws)]):
         check_overlap(part)
     approximate = np.append(kept.log_density.ravel(), posterior.evaluate(points, rng))
-    pooled = Pooled(kept.log_density.shape, log_target, approximate, q.log_density(x))
+    pooled = Pooled(
+        kept.log_density.shape, log_target, approximate, q.log_density(x), kept.population
+    )
     return Correction(x, seeds, log_estimates, pooled, fit.log_density(x))
 
 

@@ -3,7 +3,6 @@
 import json
 import warnings
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -172,9 +171,7 @@ def reweight(
         exact = ExactDensity(model, filter)
         density = ModelDensity(model, moved=noise_was_moved(idata))
         posterior, _ = build_posterior(idata, density)
-        kept = replace(
-            posterior, draws=posterior.draws[:, rows], log_density=posterior.log_density[:, rows]
-        )
+        kept = posterior.at(np.s_[:, rows])
         with row_progress(exact, enabled=progressbar) as announce:
             found = correct(posterior, kept, exact.evaluate, exact.n_noisy, rng, announce)
         draws = posterior_group(idata).isel(draw=rows)
