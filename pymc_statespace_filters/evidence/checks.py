@@ -33,7 +33,8 @@ from ..lower_chains import lower_chains
 from ..pymc_model.density import RowFunction
 from ..pymc_model.posterior_draws import are_populations
 from ..pymc_model.step_refinement import densities_by_steps, step_stability
-from .posterior import Posterior, scalar_count
+from .observed_data import scalar_count
+from .posterior import Posterior
 
 MAX_RHAT = 1.05
 # Effective draws of all chains with which R-hat and ESS are reliable (Vehtari et al. 2021).

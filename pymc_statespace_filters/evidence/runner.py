@@ -30,7 +30,9 @@ from .estimators.protocol import Estimate, Estimator, uses_draws
 from .evidence import Evidence, store_evidence
 from .exact_density import ExactDensity
 from .exchangeable_labels import exchangeable_labels, uncounted_orders
-from .posterior import Posterior, build_posterior, data_fingerprint, observation_count
+from .observed_data import data_fingerprint, observation_count
+from .posterior import Posterior
+from .posterior_of_draws import build_posterior
 from .reweighting.correction import exact_posterior
 from .unreached import check_reached
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import EvidenceWarning
 from ..evidence.evidence import Evidence, store_evidence
-from ..evidence.posterior import Observed, count_of, fingerprint_of
+from ..evidence.observed_data import Observed, count_of, fingerprint_of
 from ..filters.protocol import Filter
 from ..importance import normalised
 from ..pymc_model.held_seed import INSIDE

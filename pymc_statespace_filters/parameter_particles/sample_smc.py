@@ -11,7 +11,8 @@ import xarray as xr
 from ..compiler.native.compilation import COMPILATION
 from ..errors import ModelError
 from ..evidence.estimators.maximum_likelihood import max_log_likelihood
-from ..evidence.posterior import Posterior, observed_in
+from ..evidence.observed_data import observed_in
+from ..evidence.posterior import Posterior
 from ..filters.protocol import Filter
 from ..filters.recommendation import short_form
 from ..parallel.shared_rows import by_first_rank, outlasting_interrupts

@@ -6,7 +6,7 @@ from time import perf_counter
 import numpy as np
 import xarray as xr
 
-from ..evidence.posterior import Observed
+from ..evidence.observed_data import Observed
 from ..filters.recommendation import short_form
 from ..progress import stage_progress
 from ..pymc_model.posterior_draws import SEQUENTIAL

@@ -12,7 +12,7 @@ from scipy.stats import chi2, norm
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.evidence.estimation import ESTIMATORS
 from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
-from pymc_statespace_filters.evidence.posterior import build_posterior
+from pymc_statespace_filters.evidence.posterior_of_draws import build_posterior
 from pymc_statespace_filters.pymc_model.density import ModelDensity
 from tests.evidence import double_well
 from tests.evidence.hard_targets import (

@@ -9,10 +9,7 @@ import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.evidence.posterior import (
-    data_fingerprint,
-    observation_count,
-)
+from pymc_statespace_filters.evidence.observed_data import data_fingerprint, observation_count
 
 RECORD = np.array([[0.1, 2.0], [np.nan, 1.0], [np.nan, np.nan], [0.4, -0.0]])
 

@@ -18,7 +18,7 @@ from pymc_statespace_filters.evidence.drift.drift_evidence import _table
 from pymc_statespace_filters.evidence.drift.marginal import ConstantModel, fit_conditionals
 from pymc_statespace_filters.evidence.drift.strengths import StrengthsAtPoints
 from pymc_statespace_filters.evidence.drift.widths import bayes_factor_by_width
-from pymc_statespace_filters.evidence.posterior import build_posterior, reproducing_seeds
+from pymc_statespace_filters.evidence.posterior_of_draws import build_posterior, reproducing_seeds
 from pymc_statespace_filters.importance import LogMean, log_mean_of_draws
 from pymc_statespace_filters.pymc_model.density import ModelDensity
 from tests.systems import wandering_mean

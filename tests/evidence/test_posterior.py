@@ -12,7 +12,8 @@ import xarray as xr
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.evidence import chib_jeliazkov
 from pymc_statespace_filters.evidence.checks import check_convergence
-from pymc_statespace_filters.evidence.posterior import Posterior, build_posterior
+from pymc_statespace_filters.evidence.posterior import Posterior
+from pymc_statespace_filters.evidence.posterior_of_draws import build_posterior
 from pymc_statespace_filters.pymc_model.density import ModelDensity
 from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
 from pymc_statespace_filters.pymc_model.prior import ModelPrior

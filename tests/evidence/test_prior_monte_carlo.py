@@ -10,7 +10,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.estimators.prior_monte_carlo import PriorMonteCarlo
 from pymc_statespace_filters.evidence.estimators.smc_moves import sample_prior_particles
-from pymc_statespace_filters.evidence.posterior import build_posterior
+from pymc_statespace_filters.evidence.posterior_of_draws import build_posterior
 from pymc_statespace_filters.pymc_model.density import ModelDensity
 from tests.evidence.targets import Regression, TwoModes, bounded, half_normally_distributed
 

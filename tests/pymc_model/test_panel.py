@@ -10,10 +10,7 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.numerics.philox import seed_of_record
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.posterior import (
-    observation_count,
-    scalar_count,
-)
+from pymc_statespace_filters.evidence.observed_data import observation_count, scalar_count
 from pymc_statespace_filters.pymc_model.step_refinement import densities_by_halvings
 from pymc_statespace_filters.system.panel_records import records_of
 from tests.systems import FORCE, FORCED, forced_terms

@@ -7,7 +7,7 @@ import xarray as xr
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.posterior import (
+from pymc_statespace_filters.evidence.observed_data import (
     data_fingerprint,
     observation_count,
     scalar_count,

@@ -28,7 +28,7 @@ from ...system.checks import check_random_seed
 from ..checks import check_convergence
 from ..comparison.prior_sensitivity import width_factors
 from ..comparison.selection import check_ci_prob, prior_weights, probabilities
-from ..posterior import build_posterior, reproducing_seeds
+from ..posterior_of_draws import build_posterior, reproducing_seeds
 from .marginal import ConstantModel
 from .strengths import chosen_strengths
 from .table import DriftTable, sentences

@@ -22,7 +22,7 @@ from ...pymc_model.other_filter import model_of_draws
 from ...pymc_model.posterior_draws import MIN_DRAWS, noise_was_moved, posterior_group
 from ...system.checks import check_count, check_random_seed, is_integer
 from ..exact_density import ExactDensity
-from ..posterior import build_posterior
+from ..posterior_of_draws import build_posterior
 from .correction import Correction, correct
 from .result import reweighted_tree
 
