@@ -17,7 +17,7 @@ from ..errors import INSIDE, EvidenceWarning, ModelError
 from ..importance import largest_good_k, smoothed
 from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.other_filter import model_of_draws
-from ..pymc_model.state_graphs import StateSpaceVariable
+from ..pymc_model.state_space_variable import StateSpaceVariable
 from ..states.draws import select_draws
 from ..states.variable import select_variables
 from ..system.checks import is_integer

@@ -13,7 +13,7 @@ from ..filter_checks.finding import OFF
 from ..filters.outcomes import COLLAPSED
 from ..filters.protocol import HealthFilter
 from ..pymc_model.other_filter import model_of_draws
-from ..pymc_model.state_graphs import StateSpaceVariable
+from ..pymc_model.state_space_variable import StateSpaceVariable
 from ..states.draws import select_draws
 from ..states.groups import add_group, by_record, coords_of_steps, join_rows
 from ..states.record import Array, RecordAtDraws, States, TermHealthAtDraws, simulate_observations

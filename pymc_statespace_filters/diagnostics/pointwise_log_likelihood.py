@@ -10,10 +10,10 @@ from ..errors import ModelError
 from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.sequential_terms import warn_of_sequence
-from ..pymc_model.state_graphs import StateSpaceVariable, terms_of
+from ..pymc_model.state_space_variable import StateSpaceVariable, terms_of
 from ..states.draws import PosteriorDraws, select_draws
 from ..states.groups import add_group, coords_of_steps
-from ..states.record import Array, Graphs
+from ..states.record import Array
 from ..states.variable import VariableAtDraws, select_variables
 
 SEQUENTIAL = (
@@ -173,13 +173,7 @@ def _terms(at_draws: VariableAtDraws, progressbar: bool) -> list[Array]:
     found = []
     with at_draws.progress(f"terms of {variable.name}", enabled=progressbar):
         for record in at_draws.records:
-            evaluated = record.evaluate(_log_likelihood, seeds=record.noise_of(seeds))
-            assert evaluated is not None
-            (terms,) = evaluated
+            (terms,) = record.evaluate(terms_of(variable), {"seed": record.noise_of(seeds)})
             terms[:, : variable.score_from] = 0.0
             found.append(terms)
     return found
-
-
-def _log_likelihood(variable: StateSpaceVariable) -> Graphs:
-    return Graphs([terms_of(variable)])

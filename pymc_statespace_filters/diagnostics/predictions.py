@@ -3,24 +3,20 @@
 from typing import NamedTuple
 
 import numpy as np
-import pytensor.tensor as pt
 from numpy.typing import NDArray
 from scipy.special import log_ndtr, logsumexp, ndtri_exp
 
 from ..pit import pit_of
-from ..pymc_model.state_graphs import (
-    StateSpaceVariable,
-    exact_predictions,
-    gaussian_predictions,
-    observations_given,
-)
-from ..states.record import Array, Graphs, RecordAtDraws, States
+from ..pymc_model.observation_moments import Moments, moments_of_observations, moments_on_tape
+from ..pymc_model.state_space_variable import Evaluation, predictions_of, tape_of
+from ..states.record import Array, RecordAtDraws, States
 from .calibration import residual_limit
 
 # Fewer draws than this behind the probability of a tail, and one of them decides it.
 _LEAST_DRAWS = 3.0
 _LOWEST = -700.0  # log of a probability that is still positive in floating point
 _LEAST_PIT = 1e-16  # tests of uniformity take no 0 and no 1
+_MOST_NUMBERS = 2e6  # of the tapes of some draws
 _TOLERANCE = 1e-6  # in nats, of a term from the moments of its prediction
 
 
@@ -57,35 +53,68 @@ def laws_of(record: RecordAtDraws, before: States) -> Laws | None:
 
     The states are drawn ``before`` the observation. None where its noise is not Gaussian.
     """
-    if record.variable.system.equations.observation is None:
+    system = record.variable.system
+    if system.equations.observation is None:
         return None
-    seeds, observed = before.seeds, record.scored
-    if (found := record.evaluate(_exact, seeds=seeds)) is not None:
+    if (predictions := predictions_of(record.variable)) is not None:
+        found = record.evaluate(predictions, {"seed": before.seeds})
         mean, cov, log_below, log_above = found
         return Laws(mean, cov, log_below, log_above, known=True)
-    if (found := record.evaluate(_gaussian, seeds=seeds)) is not None:
-        terms, mean, cov = found
-        if _give_terms(mean, cov, observed, terms):
-            return Laws(mean, cov, *_tails(mean, cov, observed), known=True)
-    found = record.evaluate(_given_states, seeds=seeds, drawn=[before.drawn])
-    assert found is not None
-    mean, cov = found
-    return Laws(mean, cov, *_tails(mean, cov, observed), known=False)
+    if (taped := tape_of(record.variable)) is not None:
+        terms, mean, cov = _linearised(record, taped, before.seeds)
+        if _give_terms(mean, cov, record.scored, terms):
+            return Laws(mean, cov, *_tails(mean, cov, record.scored), known=True)
+    drawn = before.drawn.reshape(-1, system.n)
+    mean, cov = _observations(record, Moments(drawn, None), slice(None))
+    return Laws(mean, cov, *_tails(mean, cov, record.scored), known=False)
 
 
-def _exact(variable: StateSpaceVariable) -> Graphs | None:
-    graphs = exact_predictions(variable)
-    return None if graphs is None else Graphs(graphs)
+def _linearised(
+    record: RecordAtDraws, taped: Evaluation, seeds: NDArray[np.int64]
+) -> tuple[Array, Array, Array]:
+    """Terms (draws, J) and the moments of every observation before it is seen.
+
+    They are read from the tape of the filter, as if the observation were linear over the spread of
+    the state. NaN where the filter failed.
+    """
+    system = record.variable.system
+    on_tape = record.steps + np.arange(len(record.steps))
+    # The tapes of so many draws at once need some ten megabytes.
+    at_once = max(1, int(_MOST_NUMBERS / (on_tape[-1] + 1) / system.n**2))
+    found = []
+    for first in range(0, len(seeds), at_once):
+        draws = slice(first, first + at_once)
+        terms, tape = record.evaluate(taped, {"seed": seeds}, draws=draws)
+        rows = tape[:, on_tape]
+        rows[np.isneginf(terms).cumsum(axis=1) > 0] = np.nan
+        states = moments_on_tape(system, rows.reshape(-1, rows.shape[-1]))
+        found.append((terms, *_observations(record, states, draws)))
+    terms, mean, cov = map(np.concatenate, zip(*found, strict=True))
+    return terms, mean, cov
 
 
-def _gaussian(variable: StateSpaceVariable) -> Graphs | None:
-    graphs = gaussian_predictions(variable)
-    return None if graphs is None else Graphs(graphs)
-
-
-def _given_states(variable: StateSpaceVariable) -> Graphs:
-    x = pt.dmatrix("x")
-    return Graphs(observations_given(variable, x), [x])
+def _observations(record: RecordAtDraws, states: Moments, draws: slice) -> tuple[Array, Array]:
+    """Moments (draws, J, p) and (draws, J, p, p) of observations, of states draw by draw."""
+    system, theta = record.variable.system, record.theta[draws]
+    n_draws, n_rows = len(theta), len(record.steps)
+    inputs = np.zeros((1, n_rows, system.n_input_columns))
+    if system.observation_uses_inputs:
+        inputs = record.inputs[:, record.steps]
+    inputs = np.broadcast_to(
+        inputs[draws] if len(inputs) > 1 else inputs, (n_draws, *inputs.shape[1:])
+    )
+    t = np.tile(record.t0 + record.steps * system.dt, n_draws)
+    mean, cov = moments_of_observations(
+        system,
+        states,
+        t,
+        inputs.reshape(n_draws * n_rows, -1),
+        np.repeat(theta, n_rows, axis=0),
+    )
+    return (
+        mean.reshape(n_draws, n_rows, system.p),
+        cov.reshape(n_draws, n_rows, system.p, system.p),
+    )
 
 
 def calibration_of(laws: Laws, observed: Array) -> Calibration:

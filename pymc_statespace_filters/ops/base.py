@@ -72,6 +72,15 @@ class FilterOp(Op):
         """Compile or plan the function of the inputs."""
         raise NotImplementedError
 
+    def symbol(self, name: str) -> Variable:
+        """A symbol for an argument."""
+        return pt.tensor(name, dtype=_dtype(name), shape=(None,) * dict(self.arguments)[name])
+
+    @staticmethod
+    def array(name: str, value: Any) -> np.ndarray:
+        """The value of an argument, in order and of its type."""
+        return _ready(value, np.dtype(_dtype(name)))
+
     @property
     def gufunc_signature(self) -> str:
         """Core shapes, for `Blockwise`."""

@@ -14,7 +14,7 @@ from ..filters.protocol import Filter, properties
 from ..pymc_model.filter_rows import FilterRows, ParametersAtPoints, Record
 from ..pymc_model.inspection import resized
 from ..pymc_model.prior import ModelPrior
-from ..pymc_model.state_graphs import (
+from ..pymc_model.state_space_variable import (
     StateSpaceVariable,
     observed_variables,
     with_other_filter,

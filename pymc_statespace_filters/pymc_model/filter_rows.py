@@ -15,21 +15,16 @@ from pymc.pytensorf import compile as compile_pymc
 from pytensor.graph.basic import Variable
 
 from ..compiler.lowering.compiled_system import compile_system
-from ..compiler.native.planned_function import PlannedFunction
-from ..compiler.native.planned_rows import PlannedRow
-from ..compiler.native.rows import Rows, at_points
+from ..compiler.native.rows import at_points
 from ..filters.protocol import BatchFilter, Filter, ResumableFilter, properties
-from ..filters.signatures import RESUMED
 from ..filters.state_law import StateLaw
-from ..ops.base import evaluator, kernel
+from ..ops.at_rows import at_rows
+from ..ops.base import evaluator
 from ..ops.states import GoingOn, ResumableRun
 from ..parallel.shared_rows import evaluated_rows
 from ..parallel.threads import Pieces
 from ..system.model import StateSpaceModel
 
-_ARGUMENTS = [name for name, _ in RESUMED.arguments]
-_RESULTS = [name for name, _ in RESUMED.results]
-_KEPT = [_RESULTS.index("terms"), len(_RESULTS) - 1]  # and the state
 _PIECE_SECONDS = 0.02  # of one call of machine code, for whose end an interrupt waits
 _AT_ONCE = 8  # points, at least, of one call
 
@@ -137,9 +132,7 @@ class _OneByOne:
     """One point after the other in each thread, each with its own noise."""
 
     def __init__(self, system: StateSpaceModel, filter: Filter) -> None:
-        function = kernel(ResumableRun(system, filter))
-        assert isinstance(function, PlannedFunction)  # all filters that resume have a plan
-        self._function = function.loaded()
+        self._operation = ResumableRun(system, filter)
 
     def __call__(
         self, theta: Array, seeds: NDArray[np.int64], states: Array, record: Record
@@ -149,9 +142,5 @@ class _OneByOne:
         (varying if states.shape[1] else given)["state"] = (
             states if states.shape[1] else np.empty(0)
         )
-        order = [*varying, *given]
-        example = [np.asarray(values[0]) for values in varying.values()]
-        example += [np.asarray(value) for value in given.values()]
-        row = PlannedRow(self._function, [_ARGUMENTS.index(name) for name in order], example, _KEPT)
-        terms, after = Rows(row, len(varying))(*varying.values())
+        terms, after = at_rows(self._operation, ["terms", "state"], varying, given)
         return terms, after

@@ -8,7 +8,7 @@ import xarray as xr
 
 from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.other_filter import model_of_draws
-from ..pymc_model.state_graphs import observed_variables, smoothing_method
+from ..pymc_model.state_space_variable import observed_variables, smoothing_method
 from ..system.checks import check_random_seed
 from ..system.own_units import in_own_units, moments_in_own_units
 from ..system.steps import check_at, rows_at

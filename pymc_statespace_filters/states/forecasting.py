@@ -12,7 +12,7 @@ from ..errors import ModelError
 from ..evaluation.simulate import continuation
 from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.other_filter import model_of_draws
-from ..pymc_model.state_graphs import observed_variables
+from ..pymc_model.state_space_variable import observed_variables
 from ..system.checks import check_random_seed, is_integer
 from ..system.given_record import inputs_with_times
 from ..system.model import StateSpaceModel

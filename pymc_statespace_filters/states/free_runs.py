@@ -17,7 +17,7 @@ from ..evaluation.simulate import simulator
 from ..parallel.cpu_affinity import available_cores
 from ..parallel.threads import run_in_threads
 from ..pymc_model.inspection import given_model
-from ..pymc_model.state_graphs import observed_variables
+from ..pymc_model.state_space_variable import observed_variables
 from ..system.checks import check_flag, check_random_seed, shortened
 from ..system.given_record import inputs_with_times
 from ..system.model import StateSpaceModel

@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from ..pymc_model.state_graphs import StateSpaceVariable
+from ..pymc_model.state_space_variable import StateSpaceVariable
 from .record import Array
 from .variable import VariableAtDraws
 

@@ -1,19 +1,22 @@
 """One record of a state-space variable at draws of the posterior: its parameters and states."""
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import pytensor.tensor as pt
 from numpy.typing import NDArray
-from pytensor.graph.basic import Variable
 
 from ..compiler.native.python_call import call_machine_code
 from ..compiler.numerics.philox import seed_of_record
 from ..errors import ModelError
 from ..evaluation.simulate import observer
-from ..pymc_model.state_graphs import StateSpaceVariable, states_of, term_health_of
+from ..pymc_model.state_space_variable import (
+    Evaluation,
+    StateSpaceVariable,
+    states_of,
+    term_health_of,
+)
 from ..system.input_columns import inputs_of_user, n_input_rows, with_columns
 from ..system.model import StateSpaceModel
 from ..system.time_axis import TimeAxis
@@ -22,17 +25,6 @@ if TYPE_CHECKING:
     from .variable import VariableAtDraws
 
 Array = NDArray[np.float64]
-
-
-class Graphs(NamedTuple):
-    """Graphs of one record, and the inputs that they have beside those of the variable.
-
-    ``drawn`` inputs differ from draw to draw, ``constant`` ones do not.
-    """
-
-    outputs: Sequence[Variable]
-    drawn: Sequence[Variable] = ()
-    constant: Sequence[Variable] = ()
 
 
 class States(NamedTuple):
@@ -136,27 +128,37 @@ class RecordAtDraws:
         Fresh noise is used where no seed is stored.
         """
         seeds, draw_seeds = self._seeds(rng), self._fresh_seeds(rng)
-        found = self.evaluate(_states, moment, seeds=seeds, drawn=[draw_seeds], constant=[rows])
-        assert found is not None
+        drawn = {"seed": seeds, "draw_seed": draw_seeds}
+        found = self.evaluate(states_of(self.variable, moment), drawn, {"wanted": rows})
         return States(seeds, *found)
 
     def term_health(self, rng: np.random.Generator) -> TermHealthAtDraws:
         """How many members are behind every term, with the noise of each draw's estimate."""
         seeds = self._seeds(rng)
-        found = self.evaluate(_term_health, seeds=seeds)
-        assert found is not None
+        found = self.evaluate(term_health_of(self.variable), {"seed": seeds})
         return TermHealthAtDraws(seeds, *found)
 
     def evaluate(
         self,
-        build: Callable[..., Graphs | None],
-        *settings: Hashable,
-        seeds: NDArray[np.int64],
-        drawn: Sequence[np.ndarray] = (),
-        constant: Sequence[np.ndarray] = (),
-    ) -> list[Array] | None:
-        """The graphs ``build(variable, *settings)`` at every draw: see `VariableAtDraws`."""
-        return self.at_draws.evaluate(self, build, settings, seeds, drawn, constant)
+        evaluation: Evaluation,
+        drawn: Mapping[str, np.ndarray],
+        constant: Mapping[str, np.ndarray] | None = None,
+        draws: slice = slice(None),
+    ) -> list[Array]:
+        """The results of an evaluation of the record, each at every one of the ``draws``.
+
+        Its arguments beside parameters and record are ``drawn``, which differ from draw to draw, or
+        ``constant``.
+        """
+        varying = {"theta": self.theta, **drawn}
+        fixed = {"steps": self.steps, "observed": self.observed, "t0": np.asarray(self.t0)}
+        fixed |= constant or {}
+        if len(self.inputs) > 1:
+            varying["inputs"] = self.inputs
+        else:
+            fixed["inputs"] = self.inputs[0]
+        varying = {name: values[draws] for name, values in varying.items()}
+        return evaluation(varying, fixed, self.at_draws.on_progress)
 
     def arguments(self, i: int, seed: np.int64) -> tuple[Any, ...]:
         """All inputs of a likelihood at a draw, with the noise of ``seed``."""
@@ -177,15 +179,6 @@ class RecordAtDraws:
 
     def _fresh_seeds(self, rng: np.random.Generator) -> NDArray[np.int64]:
         return rng.integers(np.iinfo(np.int64).max, size=self.at_draws.n_draws)
-
-
-def _states(variable: StateSpaceVariable, moment: str) -> Graphs:
-    rows, draw_seed = pt.lvector("rows"), pt.lscalar("draw_seed")
-    return Graphs(states_of(variable, moment, rows, draw_seed), [draw_seed], [rows])
-
-
-def _term_health(variable: StateSpaceVariable) -> Graphs:
-    return Graphs(term_health_of(variable))
 
 
 def simulate_observations(

@@ -1,6 +1,6 @@
-"""A state-space variable at draws of the posterior: graphs of it, compiled once for all records."""
+"""A state-space variable at draws of the posterior: its parameters, inputs and records."""
 
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
@@ -14,7 +14,6 @@ from pytensor.graph.basic import Variable
 from pytensor.graph.replace import clone_replace
 from pytensor.graph.traversal import ancestors
 
-from ..compiler.native.compilation import undamaged_files
 from ..compiler.native.pytensor_function import NativeFunction
 from ..compiler.native.rows import Rows
 from ..compiler.numerics.philox import generators_of_records
@@ -22,13 +21,17 @@ from ..errors import ModelError
 from ..evaluation.filter_warnings import warn_about
 from ..filters.outcomes import NONE
 from ..progress import row_progress
-from ..pymc_model.state_graphs import StateSpaceVariable, observed_variables, with_other_filter
+from ..pymc_model.state_space_variable import (
+    StateSpaceVariable,
+    observed_variables,
+    with_other_filter,
+)
 from ..system.panel import panel_inputs
 from ..system.panel_records import FIRST_INPUT, RECORD, STEP, records_of
 from ..system.record import check_inputs
 from ..system.time_axis import TimeAxis
 from .draws import SAMPLE_DIMS, PosteriorDraws
-from .record import Array, Graphs, RecordAtDraws
+from .record import Array, RecordAtDraws
 
 
 class VariableAtDraws:
@@ -43,7 +46,6 @@ class VariableAtDraws:
     ) -> None:
         self._model, self.variable, self.draws = model, variable, draws
         self.on_progress: Callable[[int], None] = lambda count: None
-        self._compiled: dict[Hashable, Any] = {}
         # Stop at variables of the model: free ones are replaced by their draws.
         known = set(ancestors([variable.theta, variable.inputs], blockers=model.basic_RVs))
         free = [rv for rv in model.free_RVs if rv in known]
@@ -55,7 +57,6 @@ class VariableAtDraws:
         self._replaced |= {
             rv: pt.cast(symbol, rv.dtype) for rv, symbol in zip(free, self._symbols, strict=True)
         }
-        self._record, self._record_inputs = _one_record(variable)
         self.records = self._find_records()
 
     @property
@@ -108,38 +109,11 @@ class VariableAtDraws:
 
     @contextmanager
     def progress(self, task: str, *, enabled: bool, n_tasks: int = 1) -> Iterator[None]:
-        """Show a bar that counts the evaluations of ``n_tasks`` graphs of every record."""
+        """Show a bar that counts the evaluations of ``n_tasks`` operations on every record."""
         with row_progress(self, enabled=enabled) as begin:
             begin(task, n_tasks * self.n_draws * len(self.records))
             yield
             begin("", 0)  # fills the bar, if there were fewer
-
-    def evaluate(
-        self,
-        record: RecordAtDraws,
-        build: Callable[..., Graphs | None],
-        settings: tuple[Hashable, ...],
-        seeds: NDArray[np.int64],
-        drawn: Sequence[np.ndarray] = (),
-        constant: Sequence[np.ndarray] = (),
-    ) -> list[Array] | None:
-        """The graphs ``build(variable, *settings)`` at every draw, with the noise of ``seeds``.
-
-        They are compiled once, whatever the number of records. None if there are none.
-        """
-        if (key := (build, *settings)) not in self._compiled:
-            graphs = build(self._record, *settings)
-            self._compiled[key] = (
-                None
-                if graphs is None
-                else self._compile(
-                    graphs.outputs,
-                    [self._record.seed, *graphs.drawn, *self._record_inputs, *graphs.constant],
-                )
-            )
-        if (function := self._compiled[key]) is None:
-            return None
-        return self._call(function, [seeds, *drawn], [*_which(record), *constant])
 
     def warn_about(self, health: Sequence[Array], seeds: Sequence[NDArray[np.int64]]) -> None:
         """Warn of failures and of collapse, given health (draws, 3) and seeds of every record.
@@ -186,32 +160,20 @@ class VariableAtDraws:
                 "idata for fresh noise"
             )
 
-    def _compile(self, outputs: Sequence[Variable], inputs: Sequence[Variable]) -> Any:
-        bound = clone_replace(list(outputs), self._replaced)
-        # The index of the draw makes sure that there is at least one varying input.
-        all_inputs = [pt.lscalar("number"), *self._symbols, *inputs]
-        with undamaged_files():
-            return pytensor.function(all_inputs, bound, on_unused_input="ignore", trust_input=True)
-
-    def _call(
-        self,
-        function: Any,
-        drawn: Sequence[np.ndarray],
-        constant: Sequence[np.ndarray],
-        *,
-        is_counted: bool = True,
-    ) -> list[Array]:
-        columns = [np.arange(self.n_draws), *self._columns, *drawn]
-        first = [column[0] for column in columns]
-        rows = Rows(NativeFunction(function, [*first, *constant]), len(columns))
-        if is_counted:
-            rows.on_progress = self.on_progress
-        return rows(*columns)
-
     def _interpret(self, graph: Variable) -> Array:
+        """A graph at every draw."""
         # Microseconds for each draw: machine code would take longer to compile than it saves.
+        bound = clone_replace(graph, self._replaced)
+        # The index of the draw makes sure that there is at least one input that varies.
+        symbols = [pt.lscalar("number"), *self._symbols]
+        columns = [np.arange(self.n_draws), *self._columns]
         with pytensor.config.change_flags(mode="FAST_COMPILE"):
-            return self._call(self._compile([graph], []), [], [], is_counted=False)[0]
+            function = pytensor.function(
+                symbols, [bound], on_unused_input="ignore", trust_input=True
+            )
+        first = [column[0] for column in columns]
+        (found,) = Rows(NativeFunction(function, first), len(columns))(*columns)
+        return found
 
     def _find_records(self) -> list[RecordAtDraws]:
         """The records, from the current data of the model."""
@@ -247,33 +209,6 @@ class VariableAtDraws:
             )
             for number, (label, rows) in enumerate(zip(labels, records.slices(), strict=True))
         ]
-
-
-def _one_record(variable: StateSpaceVariable) -> tuple[StateSpaceVariable, list[Variable]]:
-    """One record of a variable, with a symbol as seed; and the inputs that tell which record."""
-    seed = pt.lscalar("seed")
-    if not variable.is_panel:
-        return variable._replace(seed=seed), []
-    number, first, end = pt.lscalar("record"), pt.lscalar("first_input"), pt.lscalar("end")
-    steps, observed = pt.lvector("steps"), pt.dmatrix("observed")
-    record = variable._replace(
-        theta=variable.theta[number],
-        steps=steps,
-        observed=observed,
-        inputs=variable.inputs[first:end],
-        seed=seed,
-    )
-    return record, [number, steps, observed, first, end]
-
-
-def _which(record: RecordAtDraws) -> list[np.ndarray]:
-    """The values of the inputs of `_one_record`."""
-    if record.code is None:
-        return []
-    ends = record.input_rows.start, record.input_rows.stop
-    return [
-        np.asarray(record.number), record.steps, record.observed, *map(np.asarray, ends)
-    ]  # fmt: skip
 
 
 def select_variables(

@@ -8,6 +8,7 @@ import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.diagnostics import predictions
 from pymc_statespace_filters.diagnostics.calibration import (
     autocorrelation_of,
     input_correlation_of,
@@ -23,15 +24,21 @@ pytestmark = pytest.mark.usefixtures("interpreted")
 A, Q, R, P0 = 0.8, 0.3, 0.2, 1.0
 LONG = np.arange(1, 301)
 SURPRISE = 200
-FORCED = psf.StateSpaceModel(
-    transition=lambda x, q, u, a, b: [a * x[0] + b * u[0] + q[0]],
-    process_noise=[[Q]],
-    observation=lambda x: [x[0]],
-    observation_noise=[[R]],
-    initial_mean=[0.0],
-    initial_cov=[[P0]],
-    inputs=["force"],
-)
+
+
+def forced(observation):
+    return psf.StateSpaceModel(
+        transition=lambda x, q, u, a, b: [a * x[0] + b * u[0] + q[0]],
+        process_noise=[[Q]],
+        observation=observation,
+        observation_noise=[[R]],
+        initial_mean=[0.0],
+        initial_cov=[[P0]],
+        inputs=["force"],
+    )
+
+
+FORCED = forced(lambda x: [x[0]])
 
 
 def diagnosed(system, filter, observed, steps, n_draws=200, inputs=None, **values):
@@ -79,6 +86,36 @@ def test_innovations_of_a_linear_system_are_kalmans():
     z = (PAIR_DATA - law.mean) / np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
     np.testing.assert_allclose(found["d_residual"], z, atol=1e-9)
     assert not found["d_clipped"].any()
+
+
+def test_draws_with_inputs_of_their_own_in_pieces(monkeypatch):
+    """The mean of exact predictions for each draw, whatever the number of draws at once."""
+    system = forced(lambda x, u: [x[0] + u[0]])
+    force, steps = np.random.default_rng(8).normal(size=(9, 1)), np.arange(1, 9)
+    observed = np.random.default_rng(9).normal(size=8)
+    a, scale = np.array([[0.2, 0.5, 0.8]]), np.array([[1.0, -2.0, 0.5]])
+    with pm.Model() as model:
+        pm.Normal("a")
+        inputs = pm.Normal("scale") * force
+        params = {"b": 1.0}
+        psf.StateSpace(
+            "d", system, psf.EKF(), steps=steps, observed=observed, inputs=inputs, params=params
+        )
+    idata = az.from_dict({"posterior": {"a": a, "scale": scale}})
+    whole = psf.filter_diagnostics(idata, model, random_seed=1)["filter_diagnostics"].to_dataset()
+    monkeypatch.setattr(predictions, "_MOST_NUMBERS", 1.0)
+    pieces = psf.filter_diagnostics(idata, model, random_seed=1)["filter_diagnostics"].to_dataset()
+    assert pieces.identical(whole)
+    means = []
+    for phi, s in zip(a[0], scale[0], strict=True):
+        law = linear_states(
+            [[phi]], [[Q]], [[1.0]], [[R]], [0.0], [[P0]],
+            steps=steps, observed=observed[:, None] - s * force[steps], rows=steps,
+            moment="predicted", forcing=s * force,
+        )  # fmt: skip
+        means.append(law.mean[:, 0] + s * force[steps, 0])
+    expected = observed - np.mean(means, axis=0)
+    np.testing.assert_allclose(whole["d_innovation"][:, 0], expected, atol=1e-9)
 
 
 @pytest.mark.parametrize(("filter", "tolerance"), [(psf.EKF(), 1e-8), (psf.GridFilter(), 0.02)])

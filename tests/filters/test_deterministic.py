@@ -6,6 +6,7 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import pytest
+import xarray as xr
 from scipy import stats
 from scipy.linalg import expm
 
@@ -18,9 +19,6 @@ from pymc_statespace_filters.filters.recommendation import alternatives
 from pymc_statespace_filters.filters.signatures import POINTS
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
-from pymc_statespace_filters.pymc_model.random_variable import NUMBERS
-from pymc_statespace_filters.pymc_model.state_graphs import StateSpaceVariable, gaussian_predictions
-from tests.modes import AS_IT_STANDS
 
 STEPS = np.array([0, 3, 4, 9])
 OBSERVED = np.array([[0.5, -0.2], [np.nan, 0.4], [np.nan, np.nan], [0.1, 0.3]])
@@ -272,19 +270,19 @@ def test_boluses_enter_by_input_rows():
 
 
 def test_predictions_have_the_noise_of_the_sensor_alone():
-    theta = theta_of()
-    record = {"steps": STEPS, "observed": OBSERVED, "inputs": FORCE, "t0": T0, "seed": 0}
-    constants = {name: pt.constant(value) for name, value in record.items()}
-    others = {"name": "d", "dims": ("d_time", "observable"), "score_from": 0, "clock": NUMBERS}
-    variable = StateSpaceVariable(
-        system=KNOWN, filter=psf.EKF(), theta=pt.dvector(), **constants, **others
+    draws = xr.DataTree.from_dict(
+        {"posterior": xr.Dataset({n: (("chain", "draw"), [[v, v]]) for n, v in THETA.items()})}
     )
-    graphs = gaussian_predictions(variable)
-    _, mean, cov = (graph.eval({variable.theta: theta}, mode=AS_IT_STANDS) for graph in graphs)
-    x = path(theta)[STEPS]
+    with pm.Model():
+        for name in THETA:
+            pm.Normal(name)
+        psf.StateSpace("d", KNOWN, psf.EKF(), steps=STEPS, observed=OBSERVED, inputs=FORCE, t0=T0)
+        found = psf.filter_diagnostics(draws, random_seed=1)["filter_diagnostics"]
+    x = path(theta_of())[STEPS]
     seen = np.column_stack([x[:, 0] + THETA["c"] * x[:, 1] ** 2, np.exp(0.3 * x[:, 1])])
-    np.testing.assert_allclose(mean, seen, rtol=1e-12)
-    np.testing.assert_allclose(cov, np.broadcast_to(NOISE, (4, 2, 2)), rtol=1e-12)
+    np.testing.assert_allclose(found["d_innovation"], OBSERVED - seen, rtol=1e-10, atol=1e-12)
+    cov = np.broadcast_to(NOISE, (4, 2, 2))
+    np.testing.assert_allclose(found["d_innovation_cov"], cov, rtol=1e-12)
 
 
 # Observations of any kind

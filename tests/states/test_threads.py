@@ -15,7 +15,7 @@ from pymc_statespace_filters import progress
 from pymc_statespace_filters.compiler.native import rows as many_calls
 from pymc_statespace_filters.compiler.native.pytensor_function import NativeFunction
 from pymc_statespace_filters.compiler.native.rows import Rows
-from pymc_statespace_filters.pymc_model.state_graphs import observed_variables
+from pymc_statespace_filters.pymc_model.state_space_variable import observed_variables
 from pymc_statespace_filters.states import free_runs
 from pymc_statespace_filters.states.draws import select_draws
 from pymc_statespace_filters.states.variable import VariableAtDraws

@@ -1,0 +1,56 @@
+"""An operation at many rows of its arguments: machine code in threads, without a graph."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+import pytensor
+
+from ..compiler.native.compilation import COMPILATION
+from ..compiler.native.planned_function import PlannedFunction
+from ..compiler.native.planned_rows import PlannedRow
+from ..compiler.native.pytensor_function import NativeFunction
+from ..compiler.native.rows import RowFunction, Rows
+from .base import FilterOp, kernel
+
+
+def at_rows(
+    operation: FilterOp,
+    results: Sequence[str],
+    varying: Mapping[str, np.ndarray],
+    constant: Mapping[str, np.ndarray],
+    on_progress: Callable[[int], None] = lambda count: None,
+) -> list[np.ndarray]:
+    """Some results of an operation, by their names, each (m, ...).
+
+    The ``varying`` arguments have a first dimension of length m, the ``constant`` ones are the same
+    for all rows. A tape has the length of one that is complete; what follows a failure in it has no
+    meaning. ``on_progress`` is as in `Rows`.
+    """
+    names = [*varying, *constant]
+    example = [
+        *(operation.array(name, values[0]) for name, values in varying.items()),
+        *(operation.array(name, values) for name, values in constant.items()),
+    ]
+    rows = Rows(_row_function(operation, names, results, example), len(varying))
+    rows.on_progress = on_progress
+    return rows(*varying.values())
+
+
+def _row_function(
+    operation: FilterOp, names: Sequence[str], results: Sequence[str], example: list[np.ndarray]
+) -> RowFunction:
+    """The function of arguments in this order."""
+    arguments = [name for name, _ in operation.arguments]
+    kept = [[name for name, _ in operation.results].index(name) for name in results]
+    with COMPILATION:
+        function = kernel(operation)
+        if isinstance(function, PlannedFunction):
+            order = [arguments.index(name) for name in names]
+            return PlannedRow(function.loaded(), order, example, kept)
+        # That of a filter without a plan, such as a user's: machine code around it is PyTensor's.
+        symbols = {name: operation.symbol(name) for name in arguments}
+        outputs = operation(*symbols.values(), return_list=True)
+        compiled = pytensor.function(
+            [symbols[name] for name in names], [outputs[i] for i in kept], trust_input=True
+        )
+    return NativeFunction(compiled, example)

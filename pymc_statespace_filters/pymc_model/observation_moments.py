@@ -1,0 +1,68 @@
+"""The law of an observation given the state or its moments, of one system at many points."""
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import pytensor
+from numpy.typing import NDArray
+
+from ..compiler.lowering.compiled_system import compile_system
+from ..compiler.lowering.symbols import jacobian_of, observation_moments, symbols_of
+from ..compiler.native.rows import at_points
+from ..system.model import StateSpaceModel
+
+Array = NDArray[np.float64]
+_ARGUMENTS = ("x", "t", "u", "theta")
+
+
+class Moments(NamedTuple):
+    """Mean (m, k) and covariance (m, k, k) of vectors; None if they are known."""
+
+    mean: Array
+    cov: Array | None
+
+
+def moments_on_tape(system: StateSpaceModel, tape: Array) -> Moments:
+    """Those of the states in rows (m, width) of the tape of a filter of moments."""
+    n = system.n
+    if compile_system(system).is_deterministic:
+        return Moments(tape[:, :n], None)
+    position = np.zeros((n, n), dtype=np.int64)
+    position[np.tril_indices(n)] = np.arange(n, n + n * (n + 1) // 2)
+    return Moments(tape[:, :n], tape[:, np.maximum(position, position.T)])
+
+
+def moments_of_observations(
+    system: StateSpaceModel, states: Moments, t: Array, u: Array, theta: Array
+) -> tuple[Array, Array]:
+    """Mean (m, p) and covariance (m, p, p) of d = h(x) + e (Eq. 4.4), linearised at the means.
+
+    Of states (m, n), times (m,), inputs (m, n_input_columns) and parameters (m, k); NaN where the
+    state is.
+    """
+    with np.errstate(all="ignore"):
+        mean, cov, jacobian = _function(system)(states.mean, t, u, theta)
+        if states.cov is not None:
+            cov = cov + jacobian @ states.cov @ np.swapaxes(jacobian, 1, 2)
+    unknown = np.isnan(states.mean).any(axis=1)
+    return (
+        np.where(unknown[:, None], np.nan, mean),
+        np.where(unknown[:, None, None], np.nan, cov),
+    )
+
+
+@lru_cache(maxsize=64)
+def _function(system: StateSpaceModel) -> Callable:
+    """h, the covariance of e, and the Jacobian of h at points, by NumPy.
+
+    All points are evaluated in one call, and machine code would take seconds to compile.
+    """
+    symbols = symbols_of(system)
+    expected, noise_cov = observation_moments(system, symbols)
+    outputs = [expected, noise_cov, jacobian_of(expected, symbols["x"])]
+    points, graphs = at_points([symbols[name] for name in _ARGUMENTS], outputs)
+    return pytensor.function(
+        points, graphs, mode="FAST_COMPILE", on_unused_input="ignore", trust_input=True
+    )
