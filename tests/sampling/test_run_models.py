@@ -15,7 +15,7 @@ from pytensor.compile.ops import wrap_py
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.sampling.run import model_task
+from pymc_statespace_filters.sampling.run import model_result
 from pymc_statespace_filters.sampling.run.model_task import ModelTask
 from pymc_statespace_filters.sampling.run.request import RunArguments, SamplingRequest
 from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
@@ -183,7 +183,7 @@ def test_a_result_takes_little_more_than_twice_its_memory(monkeypatch):
 
     settings = SETTINGS | {"draws": 40_000, "chains": 4}
     psf.sample_dram(model=model, **SETTINGS)
-    monkeypatch.setattr(model_task, "log_warnings", before_the_checks)
+    monkeypatch.setattr(model_result, "log_warnings", before_the_checks)
     thresholds = gc.get_threshold()
     gc.set_threshold(700, 10, 10)  # a user's, not those of the tests
     tracemalloc.start()

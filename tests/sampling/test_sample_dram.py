@@ -435,6 +435,6 @@ def test_an_interrupt_after_the_last_draw_keeps_all(noisy, monkeypatch, last):
         raise KeyboardInterrupt
 
     expected = sample_dram(noisy, draws=300, tune=300)
-    monkeypatch.setattr(f"pymc_statespace_filters.sampling.run.model_task.{last}", interrupted)
+    monkeypatch.setattr(f"pymc_statespace_filters.sampling.run.model_result.{last}", interrupted)
     found = sample_dram(noisy, draws=300, tune=300)
     assert found["posterior"].equals(expected["posterior"])

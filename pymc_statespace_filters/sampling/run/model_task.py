@@ -1,50 +1,25 @@
-"""All chains of one model: their starts, their results, and the DataTree made of them."""
+"""All chains of one model: their starts, how long they go on, and their results."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from pymc.model import Model
-from pymc.stats.convergence import SamplerWarning, WarningType, log_warnings
 from xarray import DataTree
 
 from ...parallel.communicator import Communicator
-from ...pymc_model.elements import element_names
-from ...pymc_model.inspection import filters_used
 from ..checkpoint.checkpoint import Checkpoint
-from ..kernel.state import ChainState, Draws, side_generator
+from ..kernel.state import ChainState, Draws
 from ..output.convergence import Convergence, convergence
-from ..output.datatree import to_datatree
-from ..output.filter_check import FilterCheck, check_filters, warn_of_filters
-from ..output.likelihood_variance import is_measured, spread_at_highest_draw
-from ..output.remedies import ways_to_mix
-from ..output.report import (
-    ENOUGH_PER_CHAIN,
-    below_known_warning,
-    closing_report,
-    few_draws_warning,
-    left_out_warnings,
-    mixing_warning,
-    until_ess_warning,
-)
-from ..output.sample_stats import stat_dims, whole_chain
-from ..output.unvisited import unvisited_warnings
-from ..output.warnings import (
-    LOWER,
-    STANDSTILL,
-    PhaseStatistics,
-    below_known,
-    chain_warnings,
-)
+from ..output.likelihood_variance import is_measured
 from ..target.initial_points import chain_candidates
 from ..target.record_target import RecordTarget, target_of
 from ..target.target import Target
 from ..target.variables import check_no_generators
 from .chain_task import ChainTask
-from .continuation import GROUP, stored_states
+from .model_result import ModelResult
 from .population_search import (
     SearchedPoints,
     WarmUp,
@@ -52,9 +27,8 @@ from .population_search import (
     search_population,
     stops_of,
 )
-from .record_chain import chain_of
 from .request import SamplingRequest
-from .stopping import ENOUGH, Length, first_length, is_enough, next_length, remedy_of, shows
+from .stopping import Length, first_length, next_length
 from .thinned_draws import Thinning
 
 # Draws of each chain from which diagnostics are computed while chains run; of ten parameters this
@@ -298,10 +272,7 @@ class ModelTask:
         tune = self.request.tune
         positions = {i: draws.positions[tune:] for i, (draws, _) in self._results.items()}
         positions |= {i: chain.positions for i, chain in running.items()}
-        if self.request.former is not None:
-            before = self.request.former.positions
-            positions = {i: np.concatenate([before[i], new]) for i, new in positions.items()}
-        return [positions[i] for i in sorted(positions)]
+        return self.request.with_former(positions)
 
     def load_missing_results(self) -> None:
         """Load chains that never ran from the checkpoint, as after an interruption."""
@@ -311,163 +282,34 @@ class ModelTask:
     @property
     def has_draws(self) -> bool:
         """Whether a chain has made an iteration that is kept."""
-        return any(n > self._n_skipped for n in self._lengths)
-
-    @property
-    def _n_skipped(self) -> int:
-        """Iterations of warm-up that are not kept."""
-        return 0 if self.request.keeps_warmup else self.request.tune
-
-    @property
-    def _lengths(self) -> list[int]:
-        """Iterations made by each chain."""
-        return [len(self._results[i][0].positions) for i in range(self.request.chains)]
+        n_skipped = self.request.n_skipped
+        return any(len(draws.positions) > n_skipped for draws, _ in self._results.values())
 
     def to_datatree(self, *, check_convergence: bool, report_level: str) -> DataTree:
-        """Make the DataTree of the results of all chains, log warnings and a report about them.
+        """Make the DataTree of the results of all chains, and log what is to be said of them.
 
-        Results are released one by one, so that the draws are in memory twice, but never three
-        times.
+        The results are handed over: the draws are in memory twice, but never three times.
         """
-        target, request = self.prepare(), self.request
-        report, mixing = self._closing_messages(check_convergence)
-        closing = left_out_warnings(self._lengths, self._n_skipped)
-        states = self._stored_states()
-        results = [self._results.pop(index) for index in range(self.request.chains)]
-        warnings = chain_warnings(target, results, request.tune, self.thin)
-        attrs, noise_warnings = self._measure_noise(target, results)
-        unreached = self._unreached_warnings(target, [draws for draws, _ in results])
-        key = results[0][1].key
-        chains = []
-        while results:
-            chains.append(whole_chain(target, *results.pop(0), request.tune, self.thin))
-        tree = to_datatree(
+        request, found, is_complete = self.request, None, self.is_complete
+        with suppress(KeyboardInterrupt):
+            if check_convergence or request.until_ess is not None:
+                found = self.convergence()
+        result = ModelResult(
             self.model,
-            target.raveled,
-            chains,
-            tune=request.tune,
-            keep_warmup=request.keeps_warmup,
-            sampling_time=self._seconds,
-            stat_dims=stat_dims(target),
+            request,
+            self.prepare(),
+            [self._results.pop(index) for index in range(request.chains)],
+            length=self.length,
+            n_iterations=self.n_iterations,
+            is_complete=is_complete,
+            measures_noise=self._measures_noise,
+            seconds=self._seconds,
+            level=self._level,
+            convergence=found,
+            said=self._said,
         )
-        tree.attrs |= {
-            **filters_used(self.model),
-            "exact": int(target.exact),
-            "refresh_noise": int(request.settings.refresh_noise),
-            "correlation": request.settings.correlation or 0.0,
-            "iterations_per_draw": self.thin,
-            **attrs,
-        }
-        if states is not None:
-            tree[GROUP] = states
-        if check_convergence and "posterior" in tree:
-            with suppress(KeyboardInterrupt):
-                rng = side_generator(key, 3)
-                noise_warnings += unvisited_warnings(tree, self.model, self._seconds, rng)
-        check = self._check_filters(tree, key) if check_convergence else FilterCheck()
-        noise_warnings += unreached
-        if not unreached and warnings.keys().isdisjoint({STANDSTILL, LOWER}):  # which explain it
-            noise_warnings += mixing
-        said = [*warnings.values(), *noise_warnings, *closing]
-        if not said and not check.warned and check_convergence:
-            report += " No problems found."
-        said += [SamplerWarning(WarningType.CONVERGENCE, report, report_level)] if report else []
-        said += check.messages(report_level)
-        log_warnings([replace(w, message=self._said(w.message)) for w in said])
-        warn_of_filters([self._said(text) for text in check.warned])
-        return tree
-
-    def _stored_states(self) -> DataTree | None:
-        """The states from which complete chains can go on."""
-        request, former = self.request, self.request.former
-        if not self.is_complete or self.n_iterations <= request.tune:
-            return None
-        return stored_states(
-            self.model,
-            [self._results[i][1] for i in range(request.chains)],
-            iterations=self.n_iterations + (0 if former is None else former.iterations),
-            draws=self.length.draws + (0 if former is None else len(former.positions[0])),
-            thin=self.thin,
-            settings=request.settings,
-        )
-
-    def _check_filters(self, tree: DataTree, key: np.ndarray) -> FilterCheck:
-        """Compare the filters with unbiased ones at some draws."""
-        if "posterior" in tree:
-            with suppress(KeyboardInterrupt):
-                rng = side_generator(key, 2)
-                return check_filters(tree, self.model, self.n_iterations, self._seconds, rng)
-        return FilterCheck()
+        return result.to_datatree(check_convergence=check_convergence, report_level=report_level)
 
     def _said(self, message: str) -> str:
         """A message about this model, with its name if there are several."""
         return f"Model {self.name!r}: {message}" if self.name else message
-
-    def _closing_messages(self, check_convergence: bool) -> tuple[str, list[SamplerWarning]]:
-        """The report, empty without draws, and a warning if the chains have not mixed."""
-        request, names = self.request, element_names(self.model, self.prepare().raveled.variables)
-        draws = [self._results[i][0] for i in range(request.chains)]
-        statistics = {
-            i: PhaseStatistics.from_draws(
-                of_chain, request.tune, len(of_chain.positions), self.thin
-            )
-            for i, of_chain in enumerate(draws)
-            if len(of_chain.positions) > request.tune
-        }
-        if not statistics:
-            return "", []
-        found = None
-        with suppress(KeyboardInterrupt):
-            if check_convergence or request.until_ess is not None:
-                found = self.convergence()
-        report = closing_report(statistics, request.tune, found, names, self.thin)
-        return report, self._mixing_warnings(check_convergence, found, names)
-
-    def _mixing_warnings(
-        self, check_convergence: bool, found: Convergence | None, names: Sequence[str]
-    ) -> list[SamplerWarning]:
-        """Warn of chains that ended too early, or have not mixed."""
-        request, n = self.request, self.length.n_iterations
-        until_ess, draws = request.until_ess, np.concatenate(self._positions({}))
-        ways = partial(ways_to_mix, self.model, names, draws)
-        if until_ess is not None and self.is_complete and not is_enough(request, found):
-            slowest = names[0] if found is None else names[int(found.rhat.argmax())]
-            remedy = remedy_of(request, self.length, found, self._seconds, ways(slowest))
-            return [until_ess_warning(until_ess, n, self._seconds, found, names, remedy)]
-        if not check_convergence:
-            return []
-        enough = float(ENOUGH_PER_CHAIN * request.chains)
-        if found is not None and not shows(request, ENOUGH) and not found.reaches(enough):
-            return [few_draws_warning(found, names, request.chains * request.draws)]
-        warning = mixing_warning(found, names, enough, n, self._seconds, ways)
-        return [] if warning is None else [warning]
-
-    def _unreached_warnings(
-        self, target: Target | RecordTarget, chains: Sequence[Draws]
-    ) -> list[SamplerWarning]:
-        """Warn if all chains stayed far below the points that the search for starts has found.
-
-        An estimate may be far too high by chance, so that this says nothing of one with noise.
-        """
-        nats = below_known(self._level, chains, self.request.tune)
-        return [] if nats is None or target.seed_names else [below_known_warning(nats)]
-
-    def _measure_noise(
-        self, target: Target | RecordTarget, results: Sequence[tuple[Draws, ChainState]]
-    ) -> tuple[dict[str, float], list[SamplerWarning]]:
-        """Measure the likelihood's noise after a complete run: an attribute, and warnings."""
-        request = self.request
-        lengths = {len(draws.positions) for draws, _ in results}
-        if self._measures_noise and lengths == {request.tune + self.length.draws}:
-            with suppress(KeyboardInterrupt):
-                keys = [state.key for _, state in results]
-                spread, warning = spread_at_highest_draw(
-                    [draws for draws, _ in results],
-                    request.tune if request.draws else 0,
-                    chain_of(target, keys[0], 0, 0).seed_spread,
-                    keys,
-                    target,
-                )
-                warnings = [] if warning is None else [warning]
-                return {"log_likelihood_variance": spread.variance}, warnings
-        return {}, []

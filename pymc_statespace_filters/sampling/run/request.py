@@ -59,6 +59,18 @@ class SamplingRequest(NamedTuple):
         """Iterations of a chain, warm-up included; the fewest with ``until_ess``."""
         return self.tune + self.draws * self.thin
 
+    @property
+    def n_skipped(self) -> int:
+        """Iterations of warm-up that are not kept."""
+        return 0 if self.keeps_warmup else self.tune
+
+    def with_former(self, positions: Mapping[int, np.ndarray]) -> list[np.ndarray]:
+        """Draws of some chains, by their numbers, each behind those that it is to go on from."""
+        if self.former is None:
+            return [positions[i] for i in sorted(positions)]
+        before = self.former.positions
+        return [np.concatenate([before[i], positions[i]]) for i in sorted(positions)]
+
     def cache_key(self, model: Model, *, require_fingerprint: bool = True) -> dict[str, Any]:
         """Give all that a model's draws depend on, as values of JSON.
 
