@@ -69,13 +69,14 @@ def filters_for(system: System, *, without: Any = None) -> list[Filter]:
     Of a deterministic system the others would repeat what the EKF computes. Where a system switches
     between regimes, filters with a single Gaussian are far off.
     """
-    found = [f for f in ((EKF(),) if system.is_deterministic else FILTERS) if _takes(f, system)]
+    found = [f for f in ((EKF(),) if system.is_deterministic else FILTERS) if takes(f, system)]
     if any(isinstance(f, _OF_REGIMES) for f in found):
         found = [f for f in found if not isinstance(f, EKF | UKF | IPLF)]
     return [f for f in found if type(f) is not type(without)]
 
 
-def _takes(filter: Filter, system: System) -> bool:
+def takes(filter: Filter, system: System) -> bool:
+    """Whether a filter can treat a system."""
     try:
         filter.check(system)
     except ModelError:

@@ -16,8 +16,9 @@ from pytensor.tensor.variable import TensorVariable
 from ..compiler.lowering.compiled_system import compile_system
 from ..errors import ModelError
 from ..filters.ekf import EKF
+from ..filters.iplf import IPLF
 from ..filters.protocol import EnsembleFilter, Filter, ToleranceFilter
-from ..filters.recommendation import check_system_and_filter
+from ..filters.recommendation import check_system_and_filter, takes
 from ..filters.signatures import PANEL
 from ..ops.distributed import CallbackLogLikelihood, CallbackLogLikelihoodOfNoise
 from ..ops.likelihood import LogLikelihood, LogLikelihoodOfNoise, StoredNoise
@@ -214,12 +215,17 @@ def coarse_filters(model: pm.Model) -> dict[str, Filter]:
     return {name: filter for name, filter in coarse.items() if filter != filters[name]}
 
 
-def pilot_filters(model: pm.Model) -> dict[str, Filter]:
-    """An `EKF` in place of each expensive filter, by names; none if a system does not allow it."""
-    found: dict[str, Filter] = {name: EKF() for name in expensive_variables(model)}
-    try:
-        for name, ekf in found.items():
-            check_system_and_filter(state_space_nodes(model)[name].op.system, ekf)
-    except ModelError:
-        return {}
+def pilot_filters(model: pm.Model, *, takes_counts: bool) -> dict[str, Filter]:
+    """An `EKF` in place of each expensive filter, by names; none if a system does not allow it.
+
+    With ``takes_counts``, an `IPLF` for counts and other observations that an `EKF` does not take.
+    """
+    candidates: list[Filter] = [EKF(), IPLF()] if takes_counts else [EKF()]
+    nodes, found = state_space_nodes(model), dict[str, Filter]()
+    for name in expensive_variables(model):
+        system = compile_system(nodes[name].op.system)
+        taken = [one for one in candidates if takes(one, system)]
+        if not taken:
+            return {}
+        found[name] = taken[0]
     return found

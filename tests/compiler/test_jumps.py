@@ -119,8 +119,8 @@ def test_a_model_with_such_a_filter_is_warned_of_where_it_is_built():
     with pm.Model() as model:
         pm.Normal("a")
         psf.StateSpace("e", switched, psf.BootstrapPF(10), **RECORD)
-    assert pilot_filters(model) == {"e": psf.EKF()}
-    with_filter([model.logp()], model, pilot_filters(model))
+    assert pilot_filters(model, takes_counts=False) == {"e": psf.EKF()}
+    with_filter([model.logp()], model, pilot_filters(model, takes_counts=False))
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.native.rows import Rows
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.outcomes import Failure, why_zero
-from pymc_statespace_filters.pymc_model.graph_rewrites import expensive_variables
+from pymc_statespace_filters.pymc_model.graph_rewrites import expensive_variables, pilot_filters
 from pymc_statespace_filters.sampling.starts.population import population_of
 from pymc_statespace_filters.sampling.target.log_density import LogDensity
 from pymc_statespace_filters.sampling.target.target import Target
@@ -192,6 +192,10 @@ COUNTS = SYSTEM | {
     "observation": None, "observation_noise": None,
     "observation_dist": lambda x, v: [pm.Poisson.dist(v + 0.0 * x[0])],
 }  # fmt: skip
+KNOWN_BY_DENSITY = SYSTEM | {
+    "observation": None, "observation_noise": None,
+    "observation_logp": lambda d, x, v: -0.5 * v * (d[0] - x[0]) ** 2,
+}  # fmt: skip
 GROWING = {"transition": lambda x, q, v: [1e30 * v * x[0] ** 5 + q[0]]}
 
 
@@ -283,6 +287,25 @@ def test_filters_that_are_expensive(filter, is_expensive):
         params = {"spread": 1.0}
         psf.StateSpace("d", autoregression(), filter, steps=[1], observed=[0.3], params=params)
     assert bool(expensive_variables(model)) == is_expensive
+
+
+@pytest.mark.parametrize(
+    ("settings", "filter"),
+    [
+        (SYSTEM | {"observation_noise": lambda v: [[v]]}, psf.EKF()),
+        (COUNTS, psf.IPLF()),
+        (KNOWN_BY_DENSITY, None),
+    ],
+)
+def test_the_gaussian_filter_that_leads_an_expensive_one(settings, filter):
+    with pm.Model() as model:
+        pm.HalfNormal("v")
+        system = psf.StateSpaceModel(**settings)
+        psf.StateSpace("d", system, psf.BootstrapPF(10), steps=[4, 5, 6], observed=np.ones(3))
+    assert pilot_filters(model, takes_counts=True) == ({} if filter is None else {"d": filter})
+    assert pilot_filters(model, takes_counts=False) == (
+        {"d": filter} if filter == psf.EKF() else {}
+    )
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,8 @@ from ..kernel.state import Draws
 from ..starts.annealing import N_SWEEPS
 from ..starts.local_scale import local_cov
 from ..starts.modes import modes_message, modes_warning
-from ..starts.population import MANY_DIMENSIONS, N_POINTS, find_population
-from ..target.target import Target
+from ..starts.population import N_POINTS, find_population
+from ..target.target import MANY_DIMENSIONS, Target
 from .request import SamplingRequest
 
 _NO_CHAIN = 2**32 - 1

@@ -57,9 +57,10 @@ def find_starts(
 
     The cost is 3000 to 16 000 evaluations of the log-density, in threads: more, the narrower the
     posterior is. If the filters are expensive and the systems allow an `EKF`, the population is
-    first led to the prior times the square root of its likelihood. From nine parameters on, if the
-    log-density or that with the `EKF` has a gradient, the points then make 12 to 160 moves along
-    it, with a metric found from their gradients; the gradient takes seconds to compile.
+    first led to the prior times the square root of its likelihood. From nine parameters on, an
+    `IPLF` does so for counts, and if the log-density or that with this filter has a gradient, the
+    points then make 12 to 160 moves along it, with a metric found from their gradients; the
+    gradient takes seconds to compile.
 
     `sample_dram` finds starts in this way itself.
 

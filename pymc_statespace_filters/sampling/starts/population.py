@@ -1,10 +1,10 @@
 """A population of points of a posterior, from which chains start and learn their proposals.
 
-Draws of the prior are annealed to the posterior. If the filters are expensive and an extended
-Kalman filter exists, it leads the way: the population is first annealed to the prior times the
-square root of its likelihood, and from there to the posterior, which takes fewer evaluations. The
-square root, because the two likelihoods may differ by many nats. Draws of some variables from a
-pilot, if there are any, lead the way instead (`nested_reference`).
+Draws of the prior are annealed to the posterior. If the filters are expensive and the systems allow
+Gaussian ones (`pilot_filters`), these lead the way: the population is first annealed to the prior
+times the square root of their likelihood, and from there to the posterior, which takes fewer
+evaluations. The square root, because the two likelihoods may differ by many nats. Draws of some
+variables from a pilot, if there are any, lead the way instead (`nested_reference`).
 
 A filter with a tolerance may be tens of times slower at draws of the prior than in the posterior.
 The points are therefore found with its coarse form, whose posterior is nearly the same, and the
@@ -13,8 +13,8 @@ filter itself evaluates only those that have been found.
 In many dimensions the moves of the annealing are too few. The population then settles by moves
 along the gradient, if there is one (`langevin`).
 
-The cost is proportional to the number of points. If they are few, the `EKF` still leads many, which
-cost little, and an expensive filter evaluates some of them.
+The cost is proportional to the number of points. If they are few, the Gaussian filter still leads
+many, which cost little, and an expensive filter evaluates some of them.
 """
 
 from collections.abc import Callable
@@ -34,16 +34,15 @@ from ..kernel.state import draw_seeds
 from ..target.initial_points import N_DRAWS
 from ..target.log_density import LogDensity
 from ..target.settings import RandomWalkSettings
-from ..target.target import Target
+from ..target.target import MANY_DIMENSIONS, Target
 from ..target.variables import RaveledVariables
 from .annealing import N_SWEEPS, Population, anneal
 from .langevin import settle
 from .modes import Points, find_modes
 
 N_POINTS = 256
-MANY_DIMENSIONS = 9  # in which moves along the gradient are worth its compilation
 _TYPICAL_EVALUATIONS = 36  # for each point, for the progress bar
-_DRAWN = 4  # draws of a reference for each point, at most N_POINTS or what the EKF has found
+_DRAWN = 4  # draws of a reference for each point, at most N_POINTS or what a Gaussian filter finds
 _DEPTH, _DEPTH_PER_DIMENSION = 10.0, 3.0  # nats below the highest point, where points are left out
 _PER_DIMENSION = 3  # points, for the metric of these moves
 _TYPICAL_MOVES = 40  # of each point, for the progress bar
@@ -129,7 +128,7 @@ def _search(
     pilot: Array | None,
 ) -> Points:
     """Points distributed nearly as a log-density, that of the target or a coarse one."""
-    led = _led_by_ekf(target, rng, progressbar=progressbar) if pilot is None else None
+    led = _led_by_gaussian(target, rng, progressbar=progressbar) if pilot is None else None
     rows = density.at_rows()
     with row_progress(rows, enabled=progressbar) as announce:
         announce("Finding starts", _TYPICAL_EVALUATIONS * n_points)
@@ -142,7 +141,7 @@ def _search(
         elif led is not None:
             x, cheap = led
             x = x[:: -(-len(x) // (_DRAWN * n_points))]
-            found = _annealed(_population(x, _from_ekf(cheap, full)), n_points, rng)
+            found = _annealed(_population(x, _from_gaussian(cheap, full)), n_points, rng)
         if found is None:
             drawn = _prior_population(target, _from_prior(full), n_points)
             found = _annealed(drawn, n_points, rng, fewest=1)
@@ -154,10 +153,10 @@ def _search(
     return Points(x, log_density, find_modes(x, lambda x: full(x)[1], rng))
 
 
-def _led_by_ekf(
+def _led_by_gaussian(
     target: Target, rng: np.random.Generator, *, progressbar: bool
 ) -> tuple[Array, Densities] | None:
-    """Points of the prior times the square root of an EKF's likelihood, and its densities.
+    """Points of the prior times the square root of a Gaussian likelihood, and its densities.
 
     None if there is none, if the filters are cheap, or if it is positive at too few points.
     """
@@ -166,7 +165,7 @@ def _led_by_ekf(
         return None
     rows = density.at_rows()
     with row_progress(rows, enabled=progressbar) as announce:
-        announce("Finding starts by an EKF", _TYPICAL_EVALUATIONS * N_POINTS)
+        announce("Finding starts by a Gaussian filter", _TYPICAL_EVALUATIONS * N_POINTS)
         cheap = _densities(rows, target, rng)
         drawn = _prior_population(target, _from_prior(cheap), N_POINTS)
         found = _annealed(drawn, N_POINTS, rng)
@@ -288,7 +287,7 @@ def _from_reference(reference: StudentMixture, full: Densities) -> Densities:
     return evaluate
 
 
-def _from_ekf(cheap: Densities, full: Densities) -> Densities:
+def _from_gaussian(cheap: Densities, full: Densities) -> Densities:
     def evaluate(x: Array) -> tuple[Array, Array]:
         first, second = cheap(x)[1], full(x)[1]
         with np.errstate(invalid="ignore"):

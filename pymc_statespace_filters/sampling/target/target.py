@@ -15,6 +15,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from ...compiler.native.rows import Rows
 from ...errors import GradientUnavailableError, ModelError
+from ...filters.protocol import Filter
 from ...parallel.communicator import Communicator
 from ...parallel.signals import held_interrupts
 from ...pymc_model.graph_rewrites import coarse_filters, expensive_variables, pilot_filters
@@ -27,6 +28,7 @@ from .sampled_model import Growth, SampledModel
 from .settings import RandomWalkSettings, checked_proposal_cov
 
 PILOT_POWER = 0.5
+MANY_DIMENSIONS = 9  # in which moves along the gradient are worth its compilation
 
 
 class Target(SampledModel):
@@ -103,12 +105,20 @@ class Target(SampledModel):
         return LogDensity(*self._shared, fixed_noise=fixed_noise, graph=graph)
 
     def pilot_density(self) -> LogDensity | None:
-        """Prior times the square root of an `EKF`'s likelihood, if the filters are expensive."""
-        filters = pilot_filters(self._model)
+        """Prior times the square root of a Gaussian likelihood, if the filters are expensive."""
+        filters = self._pilot_filters()
         if not filters:
             return None
         graph = tempered_density(self._model, filters, PILOT_POWER)
         return LogDensity(*self._shared, fixed_noise=True, graph=graph)
+
+    def _pilot_filters(self) -> dict[str, Filter]:
+        """The filters of the pilot.
+
+        In few dimensions particles find the posterior of counts as well without an `IPLF`, whose
+        compilation takes seconds.
+        """
+        return pilot_filters(self._model, takes_counts=self.raveled.dim >= MANY_DIMENSIONS)
 
     def gradient_rows(self, *, of_pilot: bool) -> Rows | None:
         """The log-density, or that of the pilot, with its gradient as the last result.
@@ -117,7 +127,7 @@ class Target(SampledModel):
         """
         graph = None
         if of_pilot:
-            graph = tempered_density(self._model, pilot_filters(self._model), PILOT_POWER)
+            graph = tempered_density(self._model, self._pilot_filters(), PILOT_POWER)
         elif self.is_expensive:
             return None
         try:
