@@ -73,7 +73,8 @@ def sample(
     max_draws : int, optional
         Iterations of each chain at most. Default: 1024 times ``draws`` with the random walk, 64
         times with NUTS. The run also ends where the next doubling would take it beyond five
-        minutes; a warning says what would do. Apart from this limit, the result depends on
+        minutes, or where chains of NUTS diverge and the last doubling has made them worth little
+        more; a warning says what would do. Apart from the limit of time, the result depends on
         ``random_seed`` and the number of chains alone.
     chains, cores : int
         Number of chains, and of those that run at a time. Default: as many as there are processors.

@@ -32,6 +32,9 @@ STATISTICS = {
     "mean_tree_accept": "acceptance_rate",
 }
 _SECONDS = 0.05
+# Share of the draws that may diverge without a word. Beyond it chains go on only as long as a
+# doubling of their iterations, which should double the effective draws, raises them so much.
+TOLERATED, _LEAST_GROWTH = 0.001, 1.25
 
 
 class NutsChains(NamedTuple):
@@ -42,6 +45,7 @@ class NutsChains(NamedTuple):
     length: Length
     found: Convergence | None
     seconds: float
+    is_stuck: bool  # whether they diverged, and ended as more iterations had not helped
 
 
 def run_nuts(
@@ -110,7 +114,7 @@ def _followed(
     sampler: Any, watch: _Watch, request: SamplingRequest, bars: ChainProgress, began: float
 ) -> NutsChains:
     """Wait for the chains, and end them at the first length whose draws are worth enough."""
-    length, found = first_length(request), None
+    length, found, is_stuck = first_length(request), None, False
     with suppress(KeyboardInterrupt):
         while True:
             time.sleep(_SECONDS)
@@ -120,16 +124,21 @@ def _followed(
             is_over = _is_finished(sampler)
             if not is_over and (not made or min(made) < request.tune + length.n_iterations):
                 continue
-            positions = _positions(sampler.inspect())
+            trace = sampler.inspect()
+            positions = _positions(trace)
             rows = slice(length.thin - 1, length.n_iterations, length.thin)
-            found = convergence(list(positions[:, rows]))
+            before, found = found, convergence(list(positions[:, rows]))
             longer = next_length(request, length, found, time.monotonic() - began)
-            if longer is None or (is_over and _n_made(positions) < longer.n_iterations):
+            is_stuck = longer is not None and _is_stuck(trace, rows, before, found)
+            if is_stuck or longer is None:
+                break
+            if is_over and _n_made(positions) < longer.n_iterations:
                 break
             length = longer
             for i in range(request.chains):
                 bars.extend(i, request.tune + length.n_iterations)
-    return _kept(sampler.abort(), length, found, time.monotonic() - began)
+    seconds = time.monotonic() - began
+    return _kept(sampler.abort(), length, found, seconds)._replace(is_stuck=is_stuck)
 
 
 def _is_finished(sampler: Any) -> bool:
@@ -140,6 +149,19 @@ def _is_finished(sampler: Any) -> bool:
 
 def _shown(chain: Any) -> dict[str, float]:
     return {"accept_rate": np.nan, "n_failed": chain.divergences}
+
+
+def _is_stuck(
+    trace: DataTree, rows: slice, before: Convergence | None, found: Convergence | None
+) -> bool:
+    """Whether chains diverge, and twice as many iterations have hardly raised what they are worth.
+
+    As at the neck of a funnel, which they do not enter however long they run.
+    """
+    if before is None or found is None or found.least_ess >= _LEAST_GROWTH * before.least_ess:
+        return False
+    diverging = trace["sample_stats"].dataset["diverging"].values[:, rows]
+    return bool(diverging.mean() > TOLERATED)
 
 
 def _positions(trace: DataTree) -> Array:
@@ -160,4 +182,4 @@ def _kept(trace: DataTree, length: Length, found: Convergence | None, seconds: f
     statistics = {
         kept: stats[name].values[:, rows] for name, kept in STATISTICS.items() if name in stats
     }
-    return NutsChains(positions[:, rows], statistics, length, found, seconds)
+    return NutsChains(positions[:, rows], statistics, length, found, seconds, is_stuck=False)

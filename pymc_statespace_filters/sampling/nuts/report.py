@@ -12,13 +12,11 @@ from ..output.report import until_ess_warning
 from ..output.warnings import sampler_warning
 from ..run.request import SamplingRequest
 from ..run.stopping import is_enough, remedy_of
-from .chains import NutsChains
+from .chains import TOLERATED, NutsChains
 
 # Bayesian fraction of missing information of the energies, below which the tails of one are too
 # long for its momenta (Betancourt 2016).
 _LEAST_E_BFMI = 0.3
-# Share of the draws that may diverge without a word.
-_TOLERATED = 0.001
 
 
 def messages_of(
@@ -36,9 +34,13 @@ def messages_of(
     problems = [*_problems(chains, names, instead), *missed]
     if request.until_ess is not None and not is_enough(request, chains.found):
         slowest = names[0] if chains.found is None else names[int(chains.found.rhat.argmax())]
-        ways = f"or {instead}" if instead else f"use sampler='dram', or reparametrise {slowest}"
+        ways = instead or f"use sampler='dram', or reparametrise {slowest}"
         n = chains.length.n_iterations
-        remedy = remedy_of(request, chains.length, chains.found, chains.seconds, ways)
+        if chains.is_stuck:
+            remedy = f"more iterations do not help draws that diverge: {ways}"
+        else:
+            ways = f"or {ways}" if instead else ways
+            remedy = remedy_of(request, chains.length, chains.found, chains.seconds, ways)
         arguments = request.until_ess, n, chains.seconds, chains.found, names, remedy
         problems.append(until_ess_warning(*arguments))
     text = _report(chains, request, names)
@@ -62,7 +64,7 @@ def _problems(
     chains: NutsChains, names: Sequence[str], instead: str | None
 ) -> list[SamplerWarning]:
     diverging, e_bfmi = chains.statistics["diverging"], _e_bfmi(chains)
-    if diverging.mean() > _TOLERATED:
+    if diverging.mean() > TOLERATED:
         return [
             sampler_warning(
                 f"{int(diverging.sum())} of {diverging.size} draws diverged, most where "
