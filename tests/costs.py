@@ -73,6 +73,7 @@ class Costs:
         event.register("numba:run_pass", Listener())
         free_pass_managers()
         compiled_on_import()
+        gc.freeze()  # what was imported stays
         self.before = self.now()
 
     @pytest.hookimpl(wrapper=True)
