@@ -61,7 +61,9 @@ def dram():
 
 
 @pytest.mark.filterwarnings("ignore:.*use of fork\\(\\) may lead to deadlocks:DeprecationWarning")
-@pytest.mark.parametrize("method", ["fork", "forkserver", "spawn"])
+@pytest.mark.parametrize(
+    "method", ["fork", pytest.param("forkserver", marks=pytest.mark.slow), "spawn"]
+)
 def test_a_compiled_model_gives_the_same_bits_in_a_child(method, densities, dram):
     """Evaluated, and in a chain by DRAM, whose proposals have noise of their own."""
     if method not in multiprocessing.get_all_start_methods():

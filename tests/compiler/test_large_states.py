@@ -112,6 +112,7 @@ def lorenz():
     )
 
 
+@pytest.mark.slow
 def test_lorenz_96_is_simulated_as_written(lorenz):
     path = psf.simulate(lorenz, {}, steps=[0, 50], random_seed=3).states.values
     x = path[:-1]

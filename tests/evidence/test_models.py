@@ -63,6 +63,7 @@ def test_the_result_is_also_a_group(regression_model):
     assert group["data_fingerprint"].item() == evidence.data_fingerprint
 
 
+@pytest.mark.slow
 def test_nuts_and_another_sampler_agree(regression_model):
     """Step methods that differ in all respects; the truth is exact, so each is tested by itself."""
     with regression_model:

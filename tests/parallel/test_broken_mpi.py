@@ -36,7 +36,7 @@ NO_LIBRARY = {"MPI4PY_LIBMPI": "/nowhere/libmpi.so", "MPI4PY_MPIABI": "none"}
 STUB = "raise RuntimeError('cannot load MPI library')"
 
 
-@pytest.mark.parametrize("broken", ["library", "module"])
+@pytest.mark.parametrize("broken", ["library", pytest.param("module", marks=pytest.mark.slow)])
 def test_only_comm_needs_mpi(tmp_path, broken):
     """The real mpi4py without its library, and a stand-in that raises wherever it is imported."""
     path = [str(ROOT)]

@@ -89,9 +89,11 @@ def check_posterior(idata, model, grid, log_density):
         assert abs(values.mean() - mean) < 4.5 * np.sqrt(variance / effective)
 
 
-@pytest.mark.parametrize("name", ["numpyro", "nutpie, gradient by PyTensor"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("numpyro", marks=pytest.mark.slow), "nutpie, gradient by PyTensor"]
+)
 def test_each_sampler_has_the_exact_posterior(name, log_density):
-    """Those that the page on JAX does not call."""
+    """One that the page on JAX does not call, and one on the system whose state is pushed."""
     with forced_model() as model:
         idata = SAMPLERS[name](500)
     check_posterior(idata, model, GRID, log_density)
