@@ -122,7 +122,7 @@ def test_draws_with_inputs_of_their_own_in_pieces(monkeypatch):
 def test_a_surprise_of_six_deviations_shows_as_six(filter, tolerance, forced_record):
     """A grid wider than the noise has an error of a hundredth in its tails."""
     force, observed, mean, sd = forced_record
-    found = diagnosed(FORCED, filter, observed, LONG, 8, inputs=force, a=A, b=1.0)
+    found = diagnosed(FORCED, filter, observed, LONG, 4, inputs=force, a=A, b=1.0)
     residual = found["d_residual"].values[:, 0]
     assert residual[SURPRISE] == pytest.approx(6.0, abs=6 * tolerance)
     np.testing.assert_allclose(residual, (observed[:, 0] - mean) / sd, atol=6 * tolerance)

@@ -169,6 +169,6 @@ def test_a_guide_that_diverges_is_not_followed():
     steps = np.arange(1, 25)
     made = psf.simulate(bearings, {}, steps=steps, random_seed=4)["observations"].values
     record = {"observed": made, "steps": steps}
-    many = log_likelihoods(bearings, psf.BootstrapPF(200_000), {}, np.arange(4), **record)
+    many = log_likelihoods(bearings, psf.BootstrapPF(50_000), {}, np.arange(4), **record)
     found = log_likelihoods(bearings, psf.GuidedPF(300), {}, np.arange(20), **record)
     assert logsumexp(found) - np.log(20) == pytest.approx(logsumexp(many) - np.log(4), abs=3.0)

@@ -110,22 +110,20 @@ class TestAutoregression:
         assert found.log_likelihood == pytest.approx(self.exact_log_likelihood(point), abs=1e-9)
 
     def test_estimated_likelihood(self):
-        """The noise has a standard deviation of one; two seeds, four displacements."""
+        """The noise has a standard deviation of one. One of 10 000 seeds fails."""
         model, (point, covariance) = self.model(psf.BootstrapPF(60)), self.exact()
-        errors, chi_square = np.sqrt(np.diag(covariance)), 0.0
-        for seed in (1, 2):
-            found = psf.maximum_likelihood(model, random_seed=seed)
-            at = np.array([found.estimate["phi"], found.estimate["spread"]])
-            simulation = np.array([*found.simulation_errors.values()])
-            assert (simulation < 0.2 * errors).all()
-            chi_square += (((at - point) / simulation) ** 2).sum()
-            np.testing.assert_allclose([*found.standard_errors.values()], errors, rtol=0.3)
-            assert 0.01 < found.log_likelihood_se < 0.3
-            difference = found.log_likelihood - self.exact_log_likelihood(at)
-            assert abs(difference) < 4 * found.log_likelihood_se
-            assert "quadratic" in found.notes[0]
+        errors = np.sqrt(np.diag(covariance))
+        found = psf.maximum_likelihood(model, random_seed=1)
+        at = np.array([found.estimate["phi"], found.estimate["spread"]])
+        simulation = np.array([*found.simulation_errors.values()])
+        assert (simulation < 0.2 * errors).all()
+        assert (((at - point) / simulation) ** 2).sum() < chi2(2).ppf(0.9999)
+        np.testing.assert_allclose([*found.standard_errors.values()], errors, rtol=0.3)
+        assert 0.01 < found.log_likelihood_se < 0.3
+        difference = found.log_likelihood - self.exact_log_likelihood(at)
+        assert abs(difference) < 4 * found.log_likelihood_se
+        assert "quadratic" in found.notes[0]
         assert "simulation_error" in found.summary()
-        assert chi_square < chi2(4).ppf(0.9999)
 
 
 def test_a_narrow_oscillator():

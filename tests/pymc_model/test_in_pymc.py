@@ -211,7 +211,7 @@ def test_exchanged_data_that_do_not_fit_stop_with_a_reason(exchangeable):
         with pytest.raises(ModelError, match="inputs has too few rows"):
             terms(exchangeable)
         with pytest.raises(ModelError, match="inputs has too few rows"):
-            pm.draw(exchangeable["d"], random_seed=1)
+            pm.draw(exchangeable["d"], random_seed=1, mode="FAST_COMPILE")
 
 
 def test_predictions_over_another_horizon(exchangeable):

@@ -25,7 +25,7 @@ def sample_dram(**settings):
     return psf.sample_dram(**with_kernel(settings))
 
 
-def chains(draws=8000, tune=1000, model=None, **settings):
+def chains(draws=4000, tune=1000, model=None, **settings):
     return psf.sample_dram(
         draws,
         tune,
@@ -56,7 +56,7 @@ def test_exact_posterior(settings):
 
 def test_the_same_test_finds_held_noise():
     """One seed's error stays in the posterior: common random numbers are not exact."""
-    idata = chains(20_000, refresh_noise=False)
+    idata = chains(refresh_noise=False)
     assert max(worst_deviations(idata)) > 6.0
 
 
@@ -164,6 +164,7 @@ def brittle(x, q, phi, narrow):
     return [phi * x[0] + gone + q[0]]
 
 
+@pytest.mark.usefixtures("interpreted")
 def test_a_screen_that_fails_where_another_step_moved():
     """DRAM waits there; what it notes down is the density of the target."""
     system = autoregression(transition=brittle, spread=0.5**0.5)

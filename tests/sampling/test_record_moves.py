@@ -19,6 +19,7 @@ ESTIMATES = np.array([[[0.0, 1.0, -1.0], [1.0, -1.0, 0.0]], [[-1.0, 0.0, 1.0], [
 NOISE = np.array([0.25, 0.5, 0.25])
 STAYS = 0.25  # of a proposal of x; symmetric
 N_UNIFORMS = 32  # no ratio of two records' densities is smaller than 1 / 32
+N_OF_ONE = 16  # and none of a record that moves alone than 1 / 16
 STATES = np.array(list(product(range(2), range(3), range(2), range(3))))  # x, u of both records
 
 
@@ -45,7 +46,7 @@ def place(state):
 @njit
 def matrix_of_record_moves(rule, population, redraws):
     """P of one sweep by a rule; with ``redraws`` each current estimate is made anew before."""
-    matrix, n = np.zeros((len(STATES), len(STATES))), N_UNIFORMS
+    matrix, n = np.zeros((len(STATES), len(STATES))), N_OF_ONE
     log_grid = np.log((np.arange(n) + 0.5) / n)
     for here in range(36):
         for there in range(36):

@@ -83,7 +83,7 @@ def test_the_law_of_a_conjugate_model():
         precision = pm.Gamma("precision", 3.0, 2.0)
         mu = pm.Normal("mu", 0.5, (2.0 / precision) ** 0.5)
         pm.Normal("y", mu, precision**-0.5, observed=data)
-    tree = sample_dram(model, draws=20_000, tune=1000)
+    tree = sample_dram(model, draws=8000, tune=1000, compute_convergence_checks=False)
     n, k = len(data), 0.5
     a = 3.0 + n / 2
     b = 2.0 + 0.5 * n * data.var() + 0.5 * k * n / (k + n) * (data.mean() - 0.5) ** 2
@@ -95,7 +95,7 @@ def test_the_law_of_a_conjugate_model():
 
 def test_draws_depend_on_the_seed_alone(noisy):
     first = sample_dram(noisy, chains=4, cores=1)
-    for cores in (2, 4, 9, None):
+    for cores in (2, 9, None):
         assert_identical(sample_dram(noisy, chains=4, cores=cores), first)
     other = sample_dram(noisy, chains=4, random_seed=2)
     chains = [*first["posterior"]["phi"].to_numpy(), *other["posterior"]["phi"].to_numpy()]
@@ -338,7 +338,8 @@ sample_dram(watched.model, draws=1, tune=1)
 for seconds, calls, tune in ((0.0, 100, 20), (0.6, 6, 0)):
     watched.seconds, watched.announced = seconds, watched.calls + calls
     tree = sample_dram(
-        watched.model, draws=10**7, tune=tune, chains=3, discard_tuned_samples=False
+        watched.model, draws=10**7, tune=tune, chains=3, discard_tuned_samples=False,
+        compute_convergence_checks=False,
     )
     sizes = {name: dict(group.sizes) for name, group in tree.children.items() if "post" in name}
     print(sizes, flush=True)
@@ -349,7 +350,7 @@ def interrupt(child, presses):
     """Output after Ctrl-C, and how long it took."""
     while child.stdout.readline() not in ("go\n", ""):
         pass
-    time.sleep(1.0)
+    time.sleep(0.3)
     begun = time.monotonic()
     for _ in range(presses):
         child.send_signal(signal.SIGINT)
