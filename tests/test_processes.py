@@ -165,12 +165,12 @@ def test_machine_code_is_found_again_and_never_mixed_up(run):
     assert not any(found)
     np.testing.assert_allclose(terms, forced_terms(0.6), rtol=1e-12)
 
-    warm, found_again, same_machine_code, others = run(
-        [{}, data], [{}, other_data], [{"observation_noise": [[0.6]]}, data]
+    warm, found_again, same_machine_code, (other,) = run(
+        [{}, data], [{"observation_noise": [[0.6]]}, other_data]
     )
     assert same_machine_code == machine_code
     assert found_again == [1] * len(found)
     assert key == cache_key(FORCED, psf.EKF().compile(compile_system(FORCED)))
     assert warm == cold
-    exact = [forced_terms(0.6, other_data), forced_terms(0.6, observation_noise=0.6)]
-    np.testing.assert_allclose(others, exact, rtol=1e-12)
+    exact = forced_terms(0.6, other_data, observation_noise=0.6)
+    np.testing.assert_allclose(other, exact, rtol=1e-12)
