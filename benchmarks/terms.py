@@ -10,6 +10,9 @@ seed, and ``particles`` a third argument that takes `BootstrapPF(200)` instead o
 Beside them are those of the exact probabilities, by quadrature over the noise and in closed form
 over the coefficients, and how far the reported ones are from these.
 
+Of 300 records, EKF: intercept 0.07 (0.09), slope 1.03 (0.07), z 0.7; reported minus exact rms
+0.003. Particles (three runs of 100): intercept 0.08 (0.09), slope 1.02 (0.06), z 0.7; rms 0.004,
+0.022 at most.
 Exact probabilities of 1000 records from seed 1001: intercept 0.03 (0.05), slope 1.03 (0.04), z 0.4.
 Twelve records from seed 101: reported minus exact has rms 0.003 and is 0.008 at most.
 """
