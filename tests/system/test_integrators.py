@@ -431,7 +431,13 @@ def evaluated(system, filter, params):
     return psf.log_likelihood(system, filter, params, Y, steps=STEPS, inputs=inputs)
 
 
-@pytest.mark.parametrize("name", EVERY)
+# Steps that only compose operations of PyTensor are among the slow tests.
+COMPOSED = ("EulerMaruyama", "RungeKutta4", "SemiImplicitEuler")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n in COMPOSED)) for n in EVERY]
+)
 def test_the_gradient_of_the_ekf_is_that_of_finite_differences(name):
     system, steps = every(name), 1e-5 * np.eye(2)
     inputs = np.array([[0.3], [-1.0], [2.0], [0.5]])[:, : system.n_inputs]
