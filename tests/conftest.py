@@ -3,7 +3,6 @@
 import gc
 import os
 import signal
-import sys
 from pathlib import Path
 
 import pytest
@@ -25,12 +24,6 @@ os.environ.setdefault("PYTENSOR_FLAGS", FLAGS)
 # Compilation makes millions of objects that stay, which the garbage collector would visit over and
 # over: a twentieth of the time.
 gc.set_threshold(50_000, 20, 10)
-
-# PyTensor imports filelock, which has Python call one of its functions at every `id()`: a fiftieth
-# of the time. It guards locks that are taken while the process forks.
-with pytest.MonkeyPatch.context() as without_hooks:
-    without_hooks.setattr(sys, "addaudithook", lambda hook: None)
-    import filelock  # noqa: F401
 
 # Pictures are drawn without a screen.
 os.environ.setdefault("MPLBACKEND", "agg")
