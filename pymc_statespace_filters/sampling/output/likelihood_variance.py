@@ -139,11 +139,11 @@ def variance_advice(
             "Start elsewhere (initvals), or give the filter more particles."
         )
     if spread.variance > TOO_NOISY:
-        share = acceptance_share(spread.variance)
+        share, more = acceptance_share(spread.variance), more_particles(spread.variance, remedy)
         return (
             f"{found} has a variance of {spread.variance:.3g} over {spread.n} noise seeds. "
             f"The chain accepts about {share:.1g} of the moves that it would accept with an exact "
-            f"likelihood, and stays long at overestimates. {_more(spread.variance, remedy)}"
+            f"likelihood, and stays long at overestimates. {more}"
         )
     if not ROUNDING < spread.variance < TOO_QUIET:
         return None
@@ -157,7 +157,7 @@ def variance_advice(
     )
 
 
-def _more(variance: float, remedy: str) -> str:
+def more_particles(variance: float, remedy: str) -> str:
     """Say what brings a variance into the range: so many particles, or something else."""
     factor = variance / MIDDLE
     if factor > MOST:

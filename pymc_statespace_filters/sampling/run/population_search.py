@@ -1,6 +1,7 @@
 """The search for starts of a model's chains, and the mixture of proposals that they share."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,11 +14,13 @@ from ..checkpoint.checkpoint import Checkpoint
 from ..kernel.independence import no_mixture
 from ..kernel.proposal_mixture import fitted_mixture, improved_mixture, warmup_parts
 from ..kernel.state import Draws
+from ..output.likelihood_variance import is_measured
 from ..starts.annealing import N_SWEEPS
 from ..starts.local_scale import local_cov
 from ..starts.modes import modes_message, modes_warning
 from ..starts.population import N_POINTS, find_population
 from ..target.target import MANY_DIMENSIONS, Target
+from .noise_at_starts import noise_warning
 from .request import SamplingRequest
 
 _NO_CHAIN = 2**32 - 1
@@ -150,6 +153,9 @@ def search_population(
         raise
     if (message := modes_message(model, target.raveled, found)) is not None:
         log_warnings([modes_warning(said(message))])
+    if is_measured(target, request.n_iterations):
+        noise = noise_warning(model, target, found, generator_of(request, 0, 1))
+        log_warnings([] if noise is None else [replace(noise, message=said(noise.message))])
     level = float(np.median(found.log_density))
     if journal is not None:
         journal.append({"population": found.x}, {"level": np.array(level)})

@@ -5,7 +5,7 @@ the compiled graph; its ``bind`` gives a `BoundLogDensity`, callable from one th
 ``native`` is what machine code calls.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -98,8 +98,10 @@ class Target(SampledModel):
     def coarse_density(self) -> LogDensity | None:
         """The log-density with coarse filters, if there are any; noise as in ``density``."""
         filters = coarse_filters(self._model)
-        if not filters:
-            return None
+        return self.density_with(filters) if filters else None
+
+    def density_with(self, filters: Mapping[str, Filter]) -> LogDensity:
+        """The log-density with other filters, given by the names of their variables."""
         graph = tempered_density(self._model, filters, 1.0)
         fixed_noise = not self.settings.refresh_noise
         return LogDensity(*self._shared, fixed_noise=fixed_noise, graph=graph)
