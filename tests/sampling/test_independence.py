@@ -29,7 +29,9 @@ from pymc_statespace_filters.sampling.kernel.independence import (
 )
 from pymc_statespace_filters.sampling.kernel.proposal_mixture import (
     FIRST_SHARE,
+    LEAST_ACCEPTANCE,
     LEAST_SHARE,
+    LEAST_WITH_NOISE,
     MOST_SHARE,
     fitted_mixture,
     improved_mixture,
@@ -226,25 +228,35 @@ def record(jumps_free, jumps_walk, dim=2, n=400, seed=9):
     return Draws(positions, np.empty((n, N_NUMBERS)), counts, empty, np.empty((0, dim, dim)))
 
 
+def share_of(draws, least=LEAST_ACCEPTANCE):
+    return next_share(0.5, [draws], 0, 400, least)
+
+
 def test_the_share_follows_the_squared_jumps():
-    assert next_share(0.5, [record(1.0, 1.0)], 0, 400) == pytest.approx(0.5, abs=0.01)
+    assert share_of(record(1.0, 1.0)) == pytest.approx(0.5, abs=0.01)
     # A third of the length is a ninth of the square: 1 / (1 + 81).
-    assert next_share(0.5, [record(0.6, 0.2)], 0, 400) == MOST_SHARE
-    third = next_share(0.5, [record(0.5, 0.65)], 0, 400)
+    assert share_of(record(0.6, 0.2)) == MOST_SHARE
+    third = share_of(record(0.5, 0.65))
     assert third == pytest.approx(0.25**2 / (0.25**2 + 0.65**4), abs=0.02)
-    assert next_share(0.5, [record(0.1, 0.6)], 0, 400) == 0.0
-    assert next_share(0.5, [record(0.0, 0.6)], 0, 400) == 0.0
+    assert share_of(record(0.1, 0.6)) == 0.0
+    assert share_of(record(0.0, 0.6)) == 0.0
+
+
+def test_fewer_acceptances_are_enough_where_noise_makes_all_moves_rare():
+    """Of 200 proposals of the mixture four count as accepted."""
+    draws, free = record(1.0, 0.02), slice(0, None, 2)
+    draws.counts[free, STAGE] = np.arange(200) % 50 == 0
+    assert share_of(draws) == 0.0
+    assert share_of(draws, LEAST_WITH_NOISE) > 0.2
 
 
 def test_a_mixture_that_is_never_accepted_keeps_only_its_least_share_while_tuning():
     rng = np.random.default_rng(10)
     packed = fitted_mixture([rng.standard_normal((100, 2))], rng)
     assert packed[SHARE] == FIRST_SHARE
-    nothing = np.empty((0, 2))
+    rest = {"population": np.empty((0, 2)), "thin": 1, "is_noisy": True}
     for tuning, expected in ((True, LEAST_SHARE), (False, 0.0)):
-        new = improved_mixture(
-            packed, [record(0.0, 0.6)], 0, 400, rng, population=nothing, thin=1, tuning=tuning
-        )
+        new = improved_mixture(packed, [record(0.0, 0.6)], 0, 400, rng, tuning=tuning, **rest)
         assert new[SHARE] == expected
 
 
@@ -252,7 +264,7 @@ def test_thinned_draws_leave_the_population_its_weight():
     """Of 200 draws of a chain near 0 the mixture has one in ten, beside 80 points near 50."""
     rng = np.random.default_rng(12)
     population = 50.0 + rng.standard_normal((80, 2))
-    chains, rest = [record(1.0, 1.0)], {"population": population, "tuning": True}
+    chains, rest = [record(1.0, 1.0)], {"population": population, "tuning": True, "is_noisy": False}
     shares = []
     for thin in (1, 10):
         packed = improved_mixture(no_mixture(2), chains, 0, 400, rng, thin=thin, **rest)

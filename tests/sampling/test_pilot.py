@@ -263,7 +263,10 @@ def test_a_mixture_is_fitted_to_the_pilots_draws_before_the_first_iteration(mode
     rows = np.concatenate(np.swapaxes(unconstrained, 0, 1))
     np.testing.assert_allclose(tasks[0].population, rows, rtol=1e-11)
     population = tasks[0].population
-    first = population_search.WarmUp(tasks[0].request, population.shape[1], population).mixture
+    warm_up = population_search.WarmUp(
+        tasks[0].request, population.shape[1], population, is_noisy=False
+    )
+    first = warm_up.mixture
     assert first[SHARE] == 0.5
     assert first[N_COMPONENTS] >= 2
     assert found["sample_stats"]["independent"].values.any()

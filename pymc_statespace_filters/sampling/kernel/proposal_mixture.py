@@ -37,6 +37,9 @@ FIRST_SHARE = 0.5  # of a mixture not tried yet
 LEAST_SHARE, MOST_SHARE = 0.2, 0.65  # the least while tuning, so that it goes on being tried
 NO_SHARE = 0.05  # a smaller one is not worth its evaluations after warm-up
 LEAST_ACCEPTANCE = 0.05  # of the mixture's proposals, else the share is as small as may be
+# The same with an estimated likelihood: a variance of 3.3, at which chains still work well, takes
+# four of five acceptances from walks and mixture alike.
+LEAST_WITH_NOISE = 0.01
 MIN_GAIN = 0.02  # nats per held-out draw, to accept a further component
 FEWEST = 10  # different draws for each dimension, to fit at all
 MOST_FITTED = 2000  # draws, more take long
@@ -59,13 +62,15 @@ def improved_mixture(
     population: Array,
     thin: int,
     tuning: bool,
+    is_noisy: bool,
 ) -> Array:
     """The packed mixture for the iterations from ``end`` on, given the one since ``begin``.
 
     It is fitted to the population (m, d), which may be empty, and one of ``thin`` of the later half
     of the draws.
     """
-    share = next_share(packed[SHARE], chains, begin, end)
+    least = LEAST_WITH_NOISE if is_noisy else LEAST_ACCEPTANCE
+    share = next_share(packed[SHARE], chains, begin, end, least)
     draws = [chain.positions[end // 2 : end][::-thin] for chain in chains]
     fitted = fitted_mixture([population, *draws], rng)
     new = packed.copy() if fitted is None else fitted
@@ -74,12 +79,14 @@ def improved_mixture(
     return new
 
 
-def next_share(share: float, chains: Sequence[Draws], begin: int, end: int) -> float:
+def next_share(
+    share: float, chains: Sequence[Draws], begin: int, end: int, least_acceptance: float
+) -> float:
     """The share, by the squared jumps for each evaluation in some iterations.
 
     They are a and b for the two kinds of proposals, in standard deviations of the draws; the share
-    is a^2 / (a^2 + b^2), and 0 if hardly a proposal of the mixture was accepted. If one kind was
-    not tried, it is `FIRST_SHARE`.
+    is a^2 / (a^2 + b^2), and 0 if fewer proposals of the mixture were accepted than the least. If
+    one kind was not tried, it is `FIRST_SHARE`.
     """
     first = max(begin, 1)
     if end == first:  # one iteration, without one before it
@@ -93,7 +100,7 @@ def next_share(share: float, chains: Sequence[Draws], begin: int, end: int) -> f
     cost = counts[:, N_EVALUATIONS] + counts[:, N_SCREENED]
     if not cost[free].sum() or not cost[~free].sum():
         return FIRST_SHARE if share == 0.0 else share
-    if (counts[free, STAGE] > 0).mean() < LEAST_ACCEPTANCE:
+    if (counts[free, STAGE] > 0).mean() < least_acceptance:
         return 0.0  # rare long jumps, as into a mode, while the random walk is still on its way
     a = squared[free].sum() / cost[free].sum()
     b = squared[~free].sum() / cost[~free].sum()

@@ -253,7 +253,8 @@ class ModelTask:
     def _warm_up(self) -> WarmUp:
         target = self.prepare()
         dim = target.raveled.dim if isinstance(target, Target) else 0
-        return WarmUp(self.request, dim, self.population)
+        is_noisy = bool(target.seed_names)
+        return WarmUp(self.request, dim, self.population, is_noisy=is_noisy)
 
     def convergence(self) -> Convergence | None:
         """Diagnostics of the results; computed once, as it takes long for many draws."""

@@ -59,6 +59,8 @@ class WarmUp:
     dim : int
         Of the mixture; 0 for chains that have none.
     population : ndarray, shape (m, d), optional
+    is_noisy : bool
+        Whether the likelihood is an estimate.
 
     Attributes
     ----------
@@ -66,8 +68,10 @@ class WarmUp:
         Packed, of the current part.
     """
 
-    def __init__(self, request: SamplingRequest, dim: int, population: np.ndarray | None):
-        self._request = request
+    def __init__(
+        self, request: SamplingRequest, dim: int, population: np.ndarray | None, *, is_noisy: bool
+    ):
+        self._request, self._is_noisy = request, is_noisy
         # In many dimensions a chain of a thousand iterations has few independent draws, and the
         # population has settled. Else the sweeps of a search are nearly the same points; a pilot
         # has one.
@@ -94,6 +98,7 @@ class WarmUp:
                 population=self._population,
                 thin=self._thin,
                 tuning=end < self._request.tune,
+                is_noisy=self._is_noisy,
             )
         return min(stop for stop in stops if stop > end)
 
