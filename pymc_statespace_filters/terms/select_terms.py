@@ -61,7 +61,8 @@ def select_terms(
         of values, for what comes and goes together.
     idata : xarray.DataTree, optional
         Posterior draws of the full model, from any sampler. They say where to look, and not what
-        the result is. Default: those of `sample`.
+        the result is. Default: those of `sample`. Where its chains mix slowly, `sample_smc` with
+        1000 draws may take less time.
     inclusion : "beta-binomial", float or mapping
         Prior of the sub-models. ``"beta-binomial"``: each number of terms is as probable as any
         other, and so are all sets of one size. A number: the probability of each term,
