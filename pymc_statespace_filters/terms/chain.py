@@ -13,6 +13,10 @@ The proposal density of a sub-model is fitted when it is first met, from points 
 stays. All weights together then give the evidences of all sub-models that were met, and
 probabilities renormalised over these, which have smaller errors than frequencies of visits but know
 nothing of what was not met. What one chain visits and no other has met shows how much that is.
+
+Where draws of the full model are no guide, the chains start with no terms, and the proposal density
+of a sub-model comes from its own maxima, which those of the sub-model that a chain comes from lead
+to (`maxima`).
 """
 
 from collections import defaultdict
@@ -25,14 +29,18 @@ from ..importance import mcse_of_chains
 from .density import Array, Sets
 from .estimates import Sampler, Visits, Weighted
 from .inclusion import InclusionPrior
+from .maxima import Maxima, Maximum, proposal_by
 from .proposals import Guide
-from .screening import REACH, Announce, improved, proposals_of, screened
+from .screening import GOOD, REACH, Announce, improved, proposals_of, screened
 from .unused import Uses
 
 N_CHAINS, N_STEPS, N_DROPPED = 4, 1000, 200  # the first steps are dropped
 STARTS = (1.0, 2.0, 3.0)  # standard deviations from where a term vanishes, to be present at first
 FEWEST, MOST = 32, 400  # points of an estimate
 VARIANCE = 0.5  # relative, of an estimate
+SUFFICIENT = 1 / (1 + VARIANCE * FEWEST)  # effective points per point, that need no more of them
+MARGIN = 3.0  # nats, of a log-evidence by a maximum
+MOST_MENDED = 60  # sub-models that get better proposals at the end, where draws are no guide
 
 
 class _Met:
@@ -45,16 +53,22 @@ class _Met:
         uses: Uses,
         sampler: Sampler,
         rng: np.random.Generator,
+        maxima: Maxima | None,
     ) -> None:
         self._prior, self._guide, self._uses = prior, guide, uses
         self._sampler, self._rng = sampler, rng
+        self._maxima = maxima
+        self._found: dict[bytes, list[Maximum]] = {}
         self._highest = -np.inf
         self._pilots: dict[bytes, Weighted] = {}
         self.points: dict[bytes, Weighted] = {}
 
-    def heights(self, sets: Sets) -> Array:
-        """New estimates of the log-posterior of sub-models (m, K), each from points of its own."""
-        by_key = {one.tobytes(): one for one in sets}
+    def heights(self, sets: Sets, before: Sets) -> Array:
+        """New estimates of the log-posterior of sub-models (m, K), each from points of its own.
+
+        ``before`` has the sub-models (m, K) from which they were reached.
+        """
+        by_key = {one.tobytes(): (one, b.tobytes()) for one, b in zip(sets, before, strict=True)}
         self._fit({key: one for key, one in by_key.items() if key not in self._pilots})
         keys = [one.tobytes() for one in sets]
         pilots = [self._pilots[key] for key in keys]
@@ -79,18 +93,28 @@ class _Met:
         points = list(self.points.values())
         return self._heights(points, np.array([one.proposal.present for one in points]))
 
-    def _fit(self, new: dict[bytes, Sets]) -> None:
+    def _fit(self, new: dict[bytes, tuple[Sets, bytes]]) -> None:
         """Fit the proposal densities of sub-models, again and again if they are within reach."""
         if not new:
             return
-        sets = np.array(list(new.values()))
+        sets = np.array([one for one, _ in new.values()])
         first = proposals_of(sets, self._guide, self._uses, self._sampler)
         log_prior = self._prior.log_weight(sets)
+        if self._maxima is not None:
+            least = self._highest - log_prior - REACH - MARGIN
+            for i, (key, (_, before)) in enumerate(new.items()):
+                known = self._found.get(before, [])
+                self._found[key] = self._maxima.of(first[i], known, least[i])
+                first[i] = proposal_by(self._found[key], first[i])
         found, chosen = screened(first, log_prior, self._sampler, self._rng, self._highest)
         self._highest = max(self._highest, self._heights(found, sets).max())
         within = np.flatnonzero(chosen).tolist()
         better = improved(
-            [found[i].proposal for i in within], self._sampler, self._rng, lambda task, total: None
+            [found[i].proposal for i in within],
+            self._sampler,
+            self._rng,
+            lambda task, total: None,
+            good=GOOD if self._maxima is None else SUFFICIENT,
         )
         for i, one in zip(within, better, strict=True):
             found[i] = one
@@ -113,18 +137,22 @@ def run_chains(
     sampler: Sampler,
     rng: np.random.Generator,
     announce: Announce,
+    maxima: Maxima | None = None,
 ) -> Visits:
-    """Let several chains walk over the sub-models, in step with each other."""
-    met = _Met(prior, guide, uses, sampler, rng)
-    at, seen = _starts(prior, guide), _Seen()
+    """Let several chains walk over the sub-models, in step with each other.
+
+    With ``maxima`` the proposal densities do without the guide.
+    """
+    met = _Met(prior, guide, uses, sampler, rng, maxima)
+    at, seen = _starts(prior, guide, maxima is None), _Seen()
     seen.note(range(N_CHAINS), at)
-    height = met.heights(at)
+    height = met.heights(at, at)
     visited = np.empty((N_CHAINS, N_STEPS, at.shape[1]), dtype=bool)
     announce("chains over sub-models", N_CHAINS * N_STEPS * FEWEST)
     for step in range(N_STEPS):
         proposed = np.array([_moved(one, prior.is_open, rng) for one in at])
         tried = np.flatnonzero((proposed != at).any(axis=1) & prior.permits(proposed))
-        new = met.heights(proposed[tried]) if tried.size else np.empty(0)
+        new = met.heights(proposed[tried], at[tried]) if tried.size else np.empty(0)
         seen.note(tried, proposed[tried])
         accepted = np.log(rng.random(len(tried))) < new - height[tried]
         at[tried[accepted]] = proposed[tried[accepted]]
@@ -134,7 +162,7 @@ def run_chains(
             lost = np.flatnonzero(met.lost(at))
             at[lost] = met.best
             seen.note(lost, at[lost])
-            height[lost] = met.heights(at[lost]) if lost.size else height[lost]
+            height[lost] = met.heights(at[lost], at[lost]) if lost.size else height[lost]
     kept = visited[:, N_DROPPED:].astype(float)
     error = [mcse_of_chains(one) if np.ptp(one) else 0.0 for one in np.moveaxis(kept, -1, 0)]
     alone = seen.alone(visited[:, N_DROPPED:])
@@ -177,10 +205,15 @@ def _moved(present: Sets, is_open: Sets, rng: np.random.Generator) -> Sets:
     return moved
 
 
-def _starts(prior: InclusionPrior, guide: Guide) -> Sets:
-    """The full model, and those of the terms that the draws say are far from vanishing."""
+def _starts(prior: InclusionPrior, guide: Guide, is_guided: bool) -> Sets:
+    """The full model, and those of the terms that the draws say are far from vanishing.
+
+    No terms, if draws are no guide.
+    """
     distance = guide.distances
-    starts = [np.ones(len(distance), dtype=bool), *(distance > limit for limit in STARTS)]
+    starts = [np.zeros(len(distance), dtype=bool)] * N_CHAINS
+    if is_guided:
+        starts = [np.ones(len(distance), dtype=bool), *(distance > limit for limit in STARTS)]
     is_certain = ~prior.is_open
     if prior.probability is not None:
         certain = prior.probability == 1

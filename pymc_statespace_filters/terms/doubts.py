@@ -64,16 +64,26 @@ def doubts(
     points: Sequence[Weighted],
     candidates: Candidates,
     visits: Visits | None,
-    full: Weighted,
+    full: Weighted | None,
 ) -> Iterator[str]:
-    """Why the errors of inclusions may be too small; ``full`` has points of the full model."""
-    if full.n_effective < LEAST_OF_FULL:
+    """Why the errors of inclusions may be too small.
+
+    ``full`` has points of the full model, unless proposals do without its draws.
+    """
+    if full is not None and full.n_effective < LEAST_OF_FULL:
         yield (
             "the draws of idata do not seem to be from the posterior of this model, or are too "
             f"few: {full.count} points that were drawn like them are worth {full.n_effective:.1f} "
             "draws of the posterior, and no better proposal was found. Give draws of psf.sample, "
             "or a filter with more particles where the likelihood is noisy"
         )
+    advice = (
+        "the draws of the full model are no guide, as the data do not determine all of its "
+        "parameters: name fewer candidates, or compare the result with that of another random_seed"
+        if full is None
+        else "give more draws of the full model as idata, or a filter with more particles where "
+        "the likelihood is noisy"
+    )
     poor = unreliable(found, points)
     share = float(found.of_models[poor].sum())
     if share > MAX_SHARE:
@@ -85,8 +95,7 @@ def doubts(
             f"{'few effective points' if few else 'weights with a heavy tail'}, such as "
             f"that with {', '.join(labels) or 'none of the terms'} (Pareto k "
             f"{points[worst].pareto_k:.2f}, {points[worst].n_effective:.0f} "
-            "effective points): give more draws of the full model as idata, or a filter with more "
-            "particles where the likelihood is noisy"
+            f"effective points): {advice}"
         )
     if visits is None:
         return

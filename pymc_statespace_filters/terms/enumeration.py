@@ -58,7 +58,7 @@ def estimate_all(
     drawn = sampler.draw([one.proposal for one in pilots], counts.tolist())
     for i, one in zip(within, drawn, strict=True):
         found[i] = one
-    found = _with_lighter_tails(found, sets, log_prior, sampler, rng, announce)
+    found = with_lighter_tails(found, sets, log_prior, sampler, rng, announce)
     return until_certain(found, sets, log_prior, sampler, announce)
 
 
@@ -90,18 +90,22 @@ def until_certain(
     return points
 
 
-def _with_lighter_tails(
+def with_lighter_tails(
     found: Sequence[Weighted],
     sets: Sets,
     log_prior: Array,
     sampler: Sampler,
     rng: np.random.Generator,
     announce: Announce,
+    most: int = MOST_POOR,
 ) -> list[Weighted]:
-    """Fresh points of better proposals, where weights that matter have a heavy tail."""
+    """Fresh points of better proposals, where weights that matter have a heavy tail.
+
+    Of so many sub-models at ``most``.
+    """
     influence = probabilities(found, sets, log_prior).influence()
     matter = np.argsort(-influence)[: (influence > HIDDEN * LARGE).sum()].tolist()
-    poor = [i for i in matter if not found[i].is_reliable][:MOST_POOR]
+    poor = [i for i in matter if not found[i].is_reliable][:most]
     trials = improved([found[i].proposal for i in poor], sampler, rng, announce, ENOUGH)
     better = list(found)
     good = [

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from ..evidence.estimators.newton import BatchFunction
 from ..importance import (
     MIN_EFFECTIVE,
     LogMean,
@@ -188,6 +189,27 @@ class Sampler:
         found = self._density.evaluate(at)
         self.n_evaluations += len(at.x)
         return np.asarray(found.total - np.where(left_out, found.own, 0.0).sum(axis=1))
+
+    def log_density_of(self, proposal: Proposal) -> BatchFunction:
+        """The log-density (n,) of a sub-model at coordinates (n, d) that its proposal draws.
+
+        Of a likelihood without noise; unused variables have some values of the prior.
+        """
+        base = self._base.copy()
+        base[proposal.unused] = self._pool[0, proposal.unused]
+
+        def evaluate(drawn: Array) -> Array:
+            y = np.tile(base, (len(drawn), 1))
+            y[:, proposal.drawn] = drawn
+            x, log_volume = proposal.coordinates.backward(y, proposal.drawn)
+            present = np.broadcast_to(proposal.present, (len(x), len(proposal.present)))
+            left_out = np.broadcast_to(
+                proposal.unused_blocks, (len(x), len(proposal.unused_blocks))
+            )
+            seeds = np.zeros((len(x), 0), dtype=np.int64)
+            return self._left(Point(x, present, seeds), left_out) - log_volume
+
+        return evaluate
 
     def draw(self, proposals: Sequence[Proposal], counts: Sequence[int]) -> list[Weighted]:
         """So many points of each proposal."""

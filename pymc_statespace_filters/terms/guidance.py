@@ -19,6 +19,7 @@ from .unused import Uses
 # posterior have 0.1 to 0.6; those that are off by six standard deviations 0.005
 # (`benchmarks.terms_poor_draws`).
 POOR = 0.1
+NO_GUIDE = 0.05  # below which even the best ones say nothing about sub-models
 N_ROUNDS, N_POINTS = 8, 2000  # of replacing them, and points of the full model for that
 
 

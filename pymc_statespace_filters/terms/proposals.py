@@ -115,9 +115,9 @@ class Guide:
         candidates = density.candidates.switches
         self._values = candidates.held_at(self.draws.shape[1])
         self._moments = values.mean(axis=0), values.std(axis=0)
-        self._coordinates = fitted_coordinates(density, self.draws, values)
-        y = self._coordinates.forward(self.draws)
-        scaled = self._coordinates.of_values(values, self.draws)
+        self.coordinates = fitted_coordinates(density, self.draws, values)
+        y = self.coordinates.forward(self.draws)
+        scaled = self.coordinates.of_values(values, self.draws)
         # The column of the fit on which an absent scalar is conditioned.
         self._given = np.arange(self.draws.shape[1])
         columns = [y]
@@ -172,7 +172,7 @@ class Guide:
         mixture = mixture.tilted(-self._slopes[~present].sum(axis=0)[drawn])
         wider = mixture.with_wide_parts(WIDE)
         blocks = np.isin(np.arange(len(unused_blocks)), self._density.blocks[unused])
-        return Proposal(present, drawn, unused, blocks, wider, wider, self._coordinates)
+        return Proposal(present, drawn, unused, blocks, wider, wider, self.coordinates)
 
     def _slopes_of_priors(self, y: Array) -> Array:
         """How the log prior densities of absent terms change with other coordinates, (K, k).
@@ -181,7 +181,7 @@ class Guide:
         part of it.
         """
         log_prior = self._density.log_prior_held(self.draws) * (
-            1 - self._coordinates.power_of_values
+            1 - self.coordinates.power_of_values
         )
         slopes = np.zeros((len(self._density.candidates), y.shape[1]))
         columns = self._density.candidates.switches.columns

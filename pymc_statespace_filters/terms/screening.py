@@ -95,10 +95,11 @@ def improved(
     rng: np.random.Generator,
     announce: Announce,
     count: int = N_PILOT,
+    good: float = GOOD,
 ) -> list[Weighted]:
     """Proposals that are fitted again until they are good, each with the points that judged it.
 
-    Each is judged by ``count`` points.
+    Each is judged by ``count`` points, and ``good`` with so many effective points per point.
     """
     current = list(proposals)
     best: dict[int, Weighted] = {}
@@ -111,7 +112,7 @@ def improved(
         for i, one in zip(pending, drawn, strict=True):
             if i not in best or one.efficiency > best[i].efficiency:
                 best[i] = one
-            if one.efficiency < GOOD:
+            if one.efficiency < good:
                 current[i] = one.refitted(rng, before[i])
                 before[i].append(one)
                 poor.append(i)

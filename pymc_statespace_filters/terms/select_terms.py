@@ -19,14 +19,15 @@ from ..pymc_model.posterior_draws import check_one_model, posterior_group
 from ..sampling import sample
 from ..system.checks import check_random_seed
 from .candidates import read_candidates
-from .chain import run_chains
+from .chain import MOST_MENDED, run_chains
 from .density import SubmodelDensity
 from .doubts import check_finite, doubts, doubts_of_potentials
 from .draws import averaged
-from .enumeration import estimate_all, probabilities, until_certain
+from .enumeration import estimate_all, probabilities, until_certain, with_lighter_tails
 from .estimates import Sampler
-from .guidance import checked_guide
+from .guidance import NO_GUIDE, checked_guide
 from .inclusion import BETA_BINOMIAL, MOST_COUNTED, read_inclusion
+from .maxima import Maxima
 from .proposals import Guide
 from .result import as_datatree
 from .unused import find_uses, prior_pool
@@ -120,9 +121,9 @@ def select_terms(
     -----
     EvidenceWarning
         If sub-models that matter have few effective points or weights with a heavy tail, if the
-        draws are not of this model's posterior and no better proposal was found, if a
-        Potential may be a part of a candidate's prior, or if chains visit a term more or less often
-        than the sub-models that were met say.
+        draws are not of this model's posterior and nothing better was found, if a Potential may be
+        a part of a candidate's prior, or if chains visit a term more or less often than the
+        sub-models that were met say.
 
     Notes
     -----
@@ -137,6 +138,11 @@ def select_terms(
     ``visits`` in ``terms``, with ``visits_se``, are the frequencies. ``inclusion`` has the smaller
     errors, but is relative to the sub-models that were met, which are those in ``models``. Its
     error contains what one chain has visited and no other has met.
+
+    Where the data do not determine all parameters of the full model, its draws are no guide to the
+    sub-models. If the likelihood has no noise, such chains then start with no terms, and the
+    mixture of a sub-model comes from its own maxima, found by Newton's method from those of the
+    sub-model that the chain comes from.
 
     Variables that only absent terms use have their prior: the scale of the slabs, the gap of a
     spring that is not there.
@@ -187,17 +193,21 @@ def select_terms(
             uses = find_uses(density, guide.draws, rng)
             sampler = Sampler(density, guide.base, prior_pool(density, uses, rng), rng)
             guide, full = checked_guide(guide, density, uses, sampler, rng, announce)
-            visits = None
+            visits = maxima = None
             if prior.n_open <= MOST_COUNTED:
                 sets = prior.all_sets()
                 points = estimate_all(sets, candidates, prior, guide, uses, sampler, rng, announce)
             else:
-                visits = run_chains(prior, guide, uses, sampler, rng, announce)
+                if full.efficiency < NO_GUIDE and not sampler.is_noisy:
+                    maxima = Maxima(density, guide, sampler, rng)
+                visits = run_chains(prior, guide, uses, sampler, rng, announce, maxima)
                 check_finite(visits.points, candidates)
-                sets = visits.sets
-                points = until_certain(
-                    visits.points, sets, prior.log_weight(sets), sampler, announce
-                )
+                sets, points = visits.sets, visits.points
+                if maxima is not None:
+                    points = with_lighter_tails(
+                        points, sets, prior.log_weight(sets), sampler, rng, announce, MOST_MENDED
+                    )
+                points = until_certain(points, sets, prior.log_weight(sets), sampler, announce)
         found = probabilities(points, sets, prior.log_weight(sets))
         if visits is not None:
             found = replace(found, missed=visits.missed(found.inclusion))
@@ -206,7 +216,7 @@ def select_terms(
         tree = as_datatree(found, points, prior.restriction(rng), visits, drawn, density, idata)
     reasons = [
         *doubts_of_potentials(model, candidates),
-        *doubts(found, points, candidates, visits, full),
+        *doubts(found, points, candidates, visits, full if maxima is None else None),
     ]
     for doubt in reasons:
         warnings.warn(

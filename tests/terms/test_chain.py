@@ -22,7 +22,7 @@ class NoisyHeights:
         self.best = np.zeros(2, dtype=bool)
         self.points = {"": SimpleNamespace(proposal=SimpleNamespace(present=self.best))}
 
-    def heights(self, sets):
+    def heights(self, sets, before):
         exact = LOG_POSTERIOR[tuple(sets.astype(int).T)]
         return exact + self.sd * self.rng.standard_normal(len(sets)) - self.sd**2 / 2
 
@@ -52,7 +52,7 @@ class Independent:
         self.log_odds, self.points = log_odds, {}
         self.best = np.zeros(len(log_odds), dtype=bool)
 
-    def heights(self, sets):
+    def heights(self, sets, before):
         for one in sets.copy():
             self.points[one.tobytes()] = SimpleNamespace(proposal=SimpleNamespace(present=one))
         return sets @ self.log_odds
