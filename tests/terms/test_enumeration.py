@@ -150,5 +150,5 @@ def test_a_heavy_tail_is_looked_into_where_the_influence_looks_small(monkeypatch
     assert enumeration.LARGE > known.influence()[2] > enumeration.HIDDEN * enumeration.LARGE
     assert known.influence()[3] < enumeration.HIDDEN * enumeration.LARGE
     sampler = Scripted([])
-    enumeration._with_lighter_tails(found, sets, np.zeros(4), sampler, rng, lambda *args: None)
+    enumeration.with_lighter_tails(found, sets, np.zeros(4), sampler, rng, lambda *args: None)
     assert asked == [found[2].proposal]
