@@ -7,6 +7,7 @@ import pymc as pm
 import pytensor.tensor as pt
 
 import pymc_statespace_filters as psf
+from benchmarks.posteriors import mass_spring_damper
 
 
 def with_priors(
@@ -206,6 +207,7 @@ def eight_schools() -> pm.Model:
 HARD: dict[str, Callable[[], pm.Model]] = {
     "predator and prey, 11": predator_prey,
     "counts of predator and prey, 11": predator_prey_counts,
+    "mass-spring-damper by particles, 9": lambda: mass_spring_damper(psf.BootstrapPF(200)),
     "library, 22": library,
     "VAR(1), 15": vector_autoregression,
     "glucose, 5": glucose,

@@ -17,8 +17,8 @@ from benchmarks.systems import MASS_SPRING_DAMPER, MASS_SPRING_DAMPER_TRUTH, sim
 N_SAMPLES, OSCILLATOR_DT = 600, 0.05
 
 
-def mass_spring_damper() -> pm.Model:
-    """Nine parameters, 101 observations, by EKF."""
+def mass_spring_damper(filter=None) -> pm.Model:
+    """Nine parameters, 101 observations, by EKF unless a filter is given."""
     inputs, observed = simulated(MASS_SPRING_DAMPER, MASS_SPRING_DAMPER_TRUTH)
     with pm.Model() as model:
         for name, sd in {"c": 1, "c3": 1, "sigma": 1, "gamma": 0.1}.items():
@@ -26,8 +26,8 @@ def mass_spring_damper() -> pm.Model:
         for name, sd in {"k": 10, "k2": 5, "k3": 5, "gain": 3, "x0": 1}.items():
             pm.Normal(name, 0, sd)
         psf.StateSpace(
-            "d", MASS_SPRING_DAMPER, psf.EKF(), steps=np.arange(0, 2001, 20), inputs=inputs,
-            observed=observed,
+            "d", MASS_SPRING_DAMPER, filter or psf.EKF(), steps=np.arange(0, 2001, 20),
+            inputs=inputs, observed=observed,
         )  # fmt: skip
     return model
 
