@@ -22,7 +22,8 @@ by bridge sampling and importance sampling of long chains. Three seeds found 0.9
 to 0.666 and 0.676 to 0.703, with errors of 0.007, 0.02 and 0.02, in 15 CPU s with the draws; eight
 chains and `chib_jeliazkov` 0.927, 0.698 and 0.712, with errors of 0.004, 0.013 and 0.013, in 306.
 All warn, of heavy tails of weights or of chains that disagree. Record 3: 0.979, 0.724 and 0.983
-with errors of 0.005, 0.037 and 0.002, in 13 CPU s; 0.970, 0.706 and 0.981 in 158. Mean z^2 2.5 of 5.
+with errors of 0.005, 0.037 and 0.002, in 13 CPU s; 0.970, 0.706 and 0.981 in 158. Mean z^2 of both
+2.5.
 
 ``double_well``, record 1: all eight terms have probabilities of 0.59 to 0.68 by `GridFilter`, and
 `BootstrapPF` differs by 0.008 at most, mean z^2 1.3; 60 CPU s, and 767 by the grid.
