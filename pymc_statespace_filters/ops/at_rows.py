@@ -1,11 +1,14 @@
 """An operation at many rows of its arguments: machine code in threads, without a graph."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from threading import Lock
+from typing import Any
 
 import numpy as np
 import pytensor
 
-from ..compiler.native.compilation import COMPILATION
+from ..compiler.native.compilation import COMPILATION, undamaged_files
 from ..compiler.native.planned_function import PlannedFunction
 from ..compiler.native.planned_rows import PlannedRow
 from ..compiler.native.pytensor_function import NativeFunction
@@ -40,17 +43,27 @@ def _row_function(
     operation: FilterOp, names: Sequence[str], results: Sequence[str], example: list[np.ndarray]
 ) -> RowFunction:
     """The function of arguments in this order."""
-    arguments = [name for name, _ in operation.arguments]
     kept = [[name for name, _ in operation.results].index(name) for name in results]
     with COMPILATION:
         function = kernel(operation)
         if isinstance(function, PlannedFunction):
+            arguments = [name for name, _ in operation.arguments]
             order = [arguments.index(name) for name in names]
             return PlannedRow(function.loaded(), order, example, kept)
-        # That of a filter without a plan, such as a user's: machine code around it is PyTensor's.
-        symbols = {name: operation.symbol(name) for name in arguments}
-        outputs = operation(*symbols.values(), return_list=True)
+        compiled, lock = _without_plan(operation, tuple(names), tuple(kept))
+    return NativeFunction(compiled, example, one_at_a_time=lock)
+
+
+# Made once for all records and calls: one takes seconds to compile.
+@lru_cache(maxsize=64)
+def _without_plan(
+    operation: FilterOp, names: tuple[str, ...], kept: tuple[int, ...]
+) -> tuple[Any, Lock]:
+    """The PyTensor function of a filter without a plan, such as a user's; a lock for its calls."""
+    symbols = {name: operation.symbol(name) for name, _ in operation.arguments}
+    outputs = operation(*symbols.values(), return_list=True)
+    with undamaged_files():
         compiled = pytensor.function(
             [symbols[name] for name in names], [outputs[i] for i in kept], trust_input=True
         )
-    return NativeFunction(compiled, example)
+    return compiled, Lock()

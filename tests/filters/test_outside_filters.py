@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+import arviz as az
 import numpy as np
 import pymc as pm
 import pytensor
@@ -19,6 +20,7 @@ from pymc_statespace_filters.filters import (
     RunFilter,
     StatesFilter,
 )
+from pymc_statespace_filters.ops.states import States
 from pymc_statespace_filters.testing import kalman_log_likelihood
 from tests.references.linear_states import linear_states
 
@@ -159,6 +161,30 @@ def test_it_is_sampled_and_gives_evidence_and_states(cubature):
     a = float(idata.posterior["a"].isel(chain=0).sel(draw=chosen))
     mean = exact_states(a, RECORD_STEPS).mean
     np.testing.assert_allclose(states["d_mean"].values[0, 0], mean, rtol=1e-6, atol=1e-8)
+
+
+def test_all_records_of_a_panel_share_one_function(cubature, monkeypatch):
+    """It takes seconds to compile."""
+    made = []
+
+    def function(inputs, outputs, *arguments, _function=pytensor.function, **options):
+        nodes = [out.owner for out in outputs if out.owner] if isinstance(outputs, list) else []
+        made.extend(node for node in nodes if isinstance(node.op, States))
+        return _function(inputs, outputs, *arguments, **options)
+
+    monkeypatch.setattr(pytensor, "function", function)
+    a = np.array([0.2, 0.7, -0.4])
+    with pytensor.config.change_flags(mode="FAST_COMPILE"), pm.Model() as model:
+        pm.Normal("a", shape=3)
+        psf.StateSpace(
+            "d", SYSTEM, cubature, steps=np.tile(RECORD_STEPS, 3), inputs=FORCE,
+            observed=np.tile(RECORD, (3, 1)), panel=np.repeat([1, 2, 3], 5),
+        )  # fmt: skip
+        draws = az.from_dict({"posterior": {"a": a[None, None]}})
+        states = psf.filtered_states(draws, model, random_seed=1)["filtered_states"]
+    assert len(made) == 5  # which are the results of one
+    exact = np.concatenate([exact_states(one, RECORD_STEPS).mean for one in a])
+    np.testing.assert_allclose(states["d_mean"].values[0, 0], exact, rtol=1e-6, atol=1e-8)
 
 
 def test_a_noisy_one_without_anything_else_is_sampled_with_fresh_noise():
