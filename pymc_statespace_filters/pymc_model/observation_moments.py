@@ -42,10 +42,12 @@ def moments_of_observations(
     Of states (m, n), times (m,), inputs (m, n_input_columns) and parameters (m, k); NaN where the
     state is.
     """
+    function = _function(system, with_jacobian=states.cov is not None)
     with np.errstate(all="ignore"):
-        mean, cov, jacobian = _function(system)(states.mean, t, u, theta)
+        mean, cov, *jacobian = function(states.mean, t, u, theta)
         if states.cov is not None:
-            cov = cov + jacobian @ states.cov @ np.swapaxes(jacobian, 1, 2)
+            (C,) = jacobian
+            cov = cov + C @ states.cov @ np.swapaxes(C, 1, 2)
     unknown = np.isnan(states.mean).any(axis=1)
     return (
         np.where(unknown[:, None], np.nan, mean),
@@ -54,14 +56,15 @@ def moments_of_observations(
 
 
 @lru_cache(maxsize=64)
-def _function(system: StateSpaceModel) -> Callable:
-    """h, the covariance of e, and the Jacobian of h at points, by NumPy.
+def _function(system: StateSpaceModel, *, with_jacobian: bool) -> Callable:
+    """h, the covariance of e, and perhaps the Jacobian of h at points, by NumPy.
 
     All points are evaluated in one call, and machine code would take seconds to compile.
     """
     symbols = symbols_of(system)
-    expected, noise_cov = observation_moments(system, symbols)
-    outputs = [expected, noise_cov, jacobian_of(expected, symbols["x"])]
+    outputs = [*observation_moments(system, symbols)]
+    if with_jacobian:
+        outputs.append(jacobian_of(outputs[0], symbols["x"]))
     points, graphs = at_points([symbols[name] for name in _ARGUMENTS], outputs)
     return pytensor.function(
         points, graphs, mode="FAST_COMPILE", on_unused_input="ignore", trust_input=True

@@ -16,6 +16,7 @@ from pymc_statespace_filters.diagnostics.calibration import (
     lags_of,
     standardised,
 )
+from pymc_statespace_filters.pymc_model import observation_moments
 from tests.references.linear_states import linear_states
 from tests.systems import PAIR, PAIR_DATA, STEPS
 
@@ -116,6 +117,18 @@ def test_draws_with_inputs_of_their_own_in_pieces(monkeypatch):
         means.append(law.mean[:, 0] + s * force[steps, 0])
     expected = observed - np.mean(means, axis=0)
     np.testing.assert_allclose(whole["d_innovation"][:, 0], expected, atol=1e-9)
+
+
+def test_observations_of_known_states_need_no_derivative(monkeypatch):
+    """Which takes longer than all else where there are millions of states."""
+    system = forced(lambda x, u: [x[0] ** 2 + u[0]])
+    monkeypatch.setattr(observation_moments, "jacobian_of", None)
+    x, force = np.array([[2.0], [np.nan]]), np.array([[0.5], [0.5]])
+    mean, cov = observation_moments.moments_of_observations(
+        system, observation_moments.Moments(x, None), np.zeros(2), force, np.ones((2, 2))
+    )
+    np.testing.assert_array_equal(mean, [[4.5], [np.nan]])
+    np.testing.assert_array_equal(cov, [[[R]], [[np.nan]]])
 
 
 @pytest.mark.parametrize(("filter", "tolerance"), [(psf.EKF(), 1e-8), (psf.GridFilter(), 0.02)])
