@@ -6,7 +6,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.sampling.output.likelihood_variance import spread_of
-from pymc_statespace_filters.sampling.run import noise_at_starts
+from pymc_statespace_filters.sampling.run import noise_at_starts, population_search
 from pymc_statespace_filters.sampling.run.chain import Chain
 from pymc_statespace_filters.sampling.run.noise_at_starts import noise_warning
 from pymc_statespace_filters.sampling.starts.modes import Points
@@ -82,3 +82,34 @@ def test_it_is_said_before_the_chains_begin(tune, is_said, caplog, monkeypatch):
         progressbar=False, compute_convergence_checks=False,
     )  # fmt: skip
     assert said == [is_said] * 2
+
+
+@pytest.mark.parametrize("was_said", [True, False])
+def test_noise_that_was_named_is_not_named_again_at_the_end(was_said, caplog, monkeypatch):
+    if not was_said:
+        monkeypatch.setattr(population_search, "noise_warning", lambda *_: None)
+    tree = psf.sample_dram(
+        10, 800, chains=2, model=seen_precisely(psf.BootstrapPF(4)), random_seed=1,
+        progressbar=False, compute_convergence_checks=False,
+    )  # fmt: skip
+    assert tree.attrs["log_likelihood_variance"] > 10.0
+    assert ("typical one of the starts" in caplog.text) is was_said
+    assert ("at its highest draw" in caplog.text) is not was_said
+
+
+def test_an_interrupt_of_the_measurement_loses_no_starts(tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    def run():
+        return psf.sample_dram(
+            10, 800, chains=1, model=seen_precisely(psf.BootstrapPF(4)), random_seed=1,
+            progressbar=False, compute_convergence_checks=False, checkpoint=tmp_path / "run",
+        )  # fmt: skip
+
+    with monkeypatch.context() as patched:
+        patched.setattr(population_search, "noise_warning", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run()
+    monkeypatch.setattr(population_search, "find_population", None)
+    assert run()["posterior"].sizes["draw"] == 10

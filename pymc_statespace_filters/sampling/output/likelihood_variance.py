@@ -6,8 +6,8 @@ moves that it would accept with an exact likelihood (the error of the kept estim
 as N(v/2, v), that of a new one as N(-v/2, v)): 48 % at v = 1, 20 % at v = 3.3, 2.5 % at v = 10.
 Noise costs moves, and particles cost time; per unit of time the best v lies between 1 and 3.3.
 
-`sample_dram` measures the variance twice: at each start, and after the run at the draw of highest
-density.
+`sample_dram` measures the variance three times: where the search for starts has ended, at each
+start, and after the run at the draw of highest density.
 
 References
 ----------

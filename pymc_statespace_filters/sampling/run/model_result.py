@@ -16,7 +16,7 @@ from ..kernel.state import ChainState, Draws, side_generator
 from ..output.convergence import Convergence
 from ..output.datatree import to_datatree
 from ..output.filter_check import FilterCheck, check_filters, warn_of_filters
-from ..output.likelihood_variance import spread_at_highest_draw
+from ..output.likelihood_variance import TOO_NOISY, spread_at_highest_draw
 from ..output.remedies import ways_to_mix
 from ..output.report import (
     ENOUGH_PER_CHAIN,
@@ -56,6 +56,8 @@ class ModelResult:
         That sampling took.
     level : float
         The median log-density of the points of the search for starts, -inf without one.
+    is_noisy : bool
+        Whether a warning has said that the likelihood is too noisy there.
     convergence : Convergence, optional
         The diagnostics, if they were asked for.
     said : callable
@@ -72,6 +74,7 @@ class ModelResult:
     measures_noise: bool
     seconds: float
     level: float
+    is_noisy: bool
     convergence: Convergence | None
     said: Callable[[str], str]
 
@@ -207,6 +210,7 @@ class ModelResult:
                     keys,
                     target,
                 )
-                warnings = [] if warning is None else [warning]
+                is_said = self.is_noisy and TOO_NOISY < spread.variance < np.inf
+                warnings = [] if warning is None or is_said else [warning]
                 return {"log_likelihood_variance": spread.variance}, warnings
         return {}, []

@@ -70,6 +70,7 @@ class ModelTask:
         self.checkpoint: Checkpoint | None = None
         self.population: np.ndarray | None = None
         self._level = -np.inf  # median log-density of the points of the search for starts
+        self._is_noisy = False  # and whether too much noise there has been named
         self._given = target
         self._target: Target | RecordTarget | None = None
         self.n_iterations = stops_of(request)[0]  # after which the chains end, for now
@@ -209,7 +210,7 @@ class ModelTask:
     def set_population(self, found: SearchedPoints | None) -> None:
         """Set what the search for starts has found."""
         if found is not None:
-            self.population, self._level = found
+            self.population, self._level, self._is_noisy = found
 
     def set_length(self, length: Length) -> None:
         """Set the length after which chains end, before any has begun."""
@@ -306,6 +307,7 @@ class ModelTask:
             measures_noise=self._measures_noise,
             seconds=self._seconds,
             level=self._level,
+            is_noisy=self._is_noisy,
             convergence=found,
             said=self._said,
         )

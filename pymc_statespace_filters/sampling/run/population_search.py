@@ -104,10 +104,14 @@ class WarmUp:
 
 
 class SearchedPoints(NamedTuple):
-    """Points of the posterior (m, d), and their median log-density, if it is known."""
+    """Points of the posterior (m, d), and their median log-density, if it is known.
+
+    ``is_noisy`` tells whether a warning has said that the likelihood is too noisy there.
+    """
 
     x: np.ndarray
     level: float = -np.inf
+    is_noisy: bool = False
 
 
 def search_population(
@@ -158,13 +162,13 @@ def search_population(
         raise
     if (message := modes_message(model, target.raveled, found)) is not None:
         log_warnings([modes_warning(said(message))])
+    level, noise = float(np.median(found.log_density)), None
+    if journal is not None:
+        journal.append({"population": found.x}, {"level": np.array(level)})
     if is_measured(target, request.n_iterations):
         noise = noise_warning(model, target, found, generator_of(request, 0, 1))
         log_warnings([] if noise is None else [replace(noise, message=said(noise.message))])
-    level = float(np.median(found.log_density))
-    if journal is not None:
-        journal.append({"population": found.x}, {"level": np.array(level)})
-    return SearchedPoints(found.x, level)
+    return SearchedPoints(found.x, level, noise is not None)
 
 
 def n_search_points(request: SamplingRequest, target: Target) -> int:
