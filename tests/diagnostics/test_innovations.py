@@ -119,6 +119,27 @@ def test_draws_with_inputs_of_their_own_in_pieces(monkeypatch):
     np.testing.assert_allclose(whole["d_innovation"][:, 0], expected, atol=1e-9)
 
 
+@pytest.mark.filterwarnings("ignore::pymc_statespace_filters.errors.FilterWarning")
+def test_predictions_before_a_failure_count():
+    """A draw whose filter fails in row 10 predicts the rows before as those of a shorter record."""
+    system = psf.StateSpaceModel(
+        transition=lambda x, q, a: [a * x[0] + q[0]],
+        process_noise=[[Q]],
+        observation=lambda x: [x[0]],
+        observation_noise=lambda t, a: [[1.0 - 0.08 * t * a]],
+        initial_mean=[0.0],
+        initial_cov=[[P0]],
+    )
+    steps, observed = np.arange(13), np.linspace(-0.5, 1.0, 13)
+    whole = diagnosed(system, psf.EKF(), observed, steps, 4, a=1.5)
+    part = diagnosed(system, psf.EKF(), observed[:10], steps[:10], 4, a=1.5)
+    assert whole["d_failed"] == 1.0
+    for name in ("d_innovation", "d_innovation_cov", "d_pit"):
+        values = whole[name].values
+        np.testing.assert_array_equal(values[:10], part[name])
+        assert np.isnan(values[10:]).all()
+
+
 def test_observations_of_known_states_need_no_derivative(monkeypatch):
     """Which takes longer than all else where there are millions of states."""
     system = forced(lambda x, u: [x[0] ** 2 + u[0]])
