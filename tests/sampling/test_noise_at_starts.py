@@ -42,6 +42,12 @@ def test_a_filter_that_was_seen_to_do_is_named():
     assert said.endswith("times as long: give the model this filter.")
 
 
+def test_a_filter_that_takes_a_hundred_times_as_long(monkeypatch):
+    spreads = iter([(spread_of(np.linspace(-9.0, 9.0, 12)), 1.0), (spread_of(np.zeros(12)), 123.4)])
+    monkeypatch.setattr(noise_at_starts, "_measured", lambda *_: next(spreads))
+    assert "an evaluation takes 120 times as long" in said_of(psf.BootstrapPF(4))
+
+
 def test_a_filter_that_is_none_or_does_not_is_not_named(monkeypatch):
     for filters in (None, {"d": psf.BootstrapPF(3)}):
         monkeypatch.setattr(noise_at_starts, "_quieter", lambda _, filters=filters: filters)

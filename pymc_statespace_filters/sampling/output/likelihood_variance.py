@@ -152,7 +152,7 @@ def variance_advice(
         return None
     return (
         f"{found} has a variance of only {spread.variance:.2g} over {spread.n} noise seeds. "
-        f"With about {_rounded(factor)} times fewer particles it would lie below {TARGET[1]:g} and "
+        f"With about {rounded(factor)} times fewer particles it would lie below {TARGET[1]:g} and "
         "the chain would gain more per unit of time; psf.suggest_particles(model) finds the number."
     )
 
@@ -163,7 +163,7 @@ def more_particles(variance: float, remedy: str) -> str:
     if factor > MOST:
         return f"More particles would hardly do. {remedy}".rstrip()
     return (
-        f"The variance is about proportional to 1/N for N particles: {_rounded(factor)} times as "
+        f"The variance is about proportional to 1/N for N particles: {rounded(factor)} times as "
         f"many would bring it between {TARGET[0]:g} and {TARGET[1]:g}; "
         "psf.suggest_particles(model) finds the number."
     )
@@ -212,7 +212,7 @@ def spread_at_highest_draw(
     return spread, None if message is None else sampler_warning(message)
 
 
-def _rounded(factor: float) -> str:
+def rounded(factor: float) -> str:
     """Format a factor with two digits, without an exponent."""
     digits = 1 - math.floor(math.log10(factor))
     return f"{round(factor, digits):.{max(0, digits)}f}"

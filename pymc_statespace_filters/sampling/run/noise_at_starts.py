@@ -23,6 +23,7 @@ from ..output.likelihood_variance import (
     SeedSpread,
     acceptance_share,
     more_particles,
+    rounded,
     seed_spread,
 )
 from ..output.warnings import sampler_warning
@@ -48,7 +49,7 @@ def noise_warning(
             less = f"{other.variance:.1g}" if other.variance > ROUNDING else "zero"
             remedy = (
                 f"With {names} the variance is {less} there, and an evaluation takes "
-                f"{longer / seconds:.2g} times as long: give the model this filter."
+                f"{rounded(longer / seconds)} times as long: give the model this filter."
             )
     return sampler_warning(
         "At a typical one of the starts the estimated log-likelihood has a variance of "
