@@ -6,10 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 import pytensor
+import pytensor.tensor as pt
 from numpy.typing import NDArray
 
 from ..compiler.lowering.compiled_system import compile_system
-from ..compiler.lowering.symbols import jacobian_of, observation_moments, symbols_of
+from ..compiler.lowering.symbols import observation_moments, symbols_of
 from ..compiler.native.rows import at_points
 from ..system.model import StateSpaceModel
 
@@ -62,10 +63,15 @@ def _function(system: StateSpaceModel, *, with_jacobian: bool) -> Callable:
     All points are evaluated in one call, and machine code would take seconds to compile.
     """
     symbols = symbols_of(system)
-    outputs = [*observation_moments(system, symbols)]
-    if with_jacobian:
-        outputs.append(jacobian_of(outputs[0], symbols["x"]))
+    outputs = observation_moments(system, symbols)
     points, graphs = at_points([symbols[name] for name in _ARGUMENTS], outputs)
+    if with_jacobian:
+        # The gradient of a sum over the points has that of each point in its row.
+        rows = [
+            pt.grad(graphs[0][:, i].sum(), points[0], disconnected_inputs="ignore")
+            for i in range(system.p)
+        ]
+        graphs.append(pt.stack(rows, axis=1))
     return pytensor.function(
         points, graphs, mode="FAST_COMPILE", on_unused_input="ignore", trust_input=True
     )

@@ -143,7 +143,7 @@ def test_predictions_before_a_failure_count():
 def test_observations_of_known_states_need_no_derivative(monkeypatch):
     """Which takes longer than all else where there are millions of states."""
     system = forced(lambda x, u: [x[0] ** 2 + u[0]])
-    monkeypatch.setattr(observation_moments, "jacobian_of", None)
+    monkeypatch.setattr(observation_moments.pt, "grad", None)
     x, force = np.array([[2.0], [np.nan]]), np.array([[0.5], [0.5]])
     mean, cov = observation_moments.moments_of_observations(
         system, observation_moments.Moments(x, None), np.zeros(2), force, np.ones((2, 2))
