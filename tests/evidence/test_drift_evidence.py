@@ -7,6 +7,7 @@ import arviz as az
 import numpy as np
 import pymc as pm
 import pytest
+import xarray as xr
 from scipy.integrate import quad
 from scipy.stats import halfnorm, multivariate_normal, norm, uniform
 
@@ -21,6 +22,7 @@ from pymc_statespace_filters.evidence.drift.widths import bayes_factor_by_width
 from pymc_statespace_filters.evidence.posterior_of_draws import build_posterior, reproducing_seeds
 from pymc_statespace_filters.importance import LogMean, log_mean_of_draws
 from pymc_statespace_filters.pymc_model.density import ModelDensity
+from pymc_statespace_filters.pymc_model.posterior_draws import BY_PARTICLES
 from tests.systems import wandering_mean
 
 N_ROWS, MEAN_SD, WIDTH = 12, 2.0, 0.5
@@ -137,6 +139,25 @@ def test_widths_are_those_of_quadrature():
     assert (curve["width_se"] < 0.06).all()
     np.testing.assert_allclose(curve["width_prob"][1], found["prob"].iloc[0])
     psf.plot_prior_sensitivity(found.widths, backend="none")
+
+
+def test_errors_of_the_curve_are_those_of_populations():
+    """Whose draws alternate along the chains, where their means cancel."""
+    model, observed = drifting_model(0.0, 1)
+    idata = exact_draws(observed, *PRIORS["half-normal"])
+    sizes = idata["posterior"].sizes
+    shape = sizes["chain"], sizes["draw"]
+    population = np.broadcast_to(np.arange(shape[1]) % 4, shape)
+    rng = np.random.default_rng(1)
+    terms = {("mu_strength",): 0.1 * population + 0.1 * rng.standard_normal(shape)}
+    error = []
+    for sampler in ("", BY_PARTICLES):
+        idata.attrs["sampler"] = sampler
+        stats = xr.Dataset({"population": (("chain", "draw"), population)})
+        idata["sample_stats"] = xr.DataTree(stats)
+        found = bayes_factor_by_width(model, idata, terms, np.array([1.0]), np.log([0.5] * 2), 0.95)
+        error.append(float(found["width_se"].max()))
+    assert error[1] > 10 * error[0] > 0
 
 
 def test_errors_that_both_means_share_cancel_in_the_curve():

@@ -194,9 +194,7 @@ class ModelResult:
         nats = below_known(self.level, chains, self.request.tune)
         return [] if nats is None or self.target.seed_names else [below_known_warning(nats)]
 
-    def _measure_noise(
-        self,
-    ) -> tuple[dict[str, float], list[SamplerWarning]]:
+    def _measure_noise(self) -> tuple[dict[str, float], list[SamplerWarning]]:
         """Measure the likelihood's noise after a complete run: an attribute, and warnings."""
         request, target, results = self.request, self.target, self.results
         lengths = {len(draws.positions) for draws, _ in results}

@@ -288,9 +288,9 @@ class ModelTask:
         return any(len(draws.positions) > n_skipped for draws, _ in self._results.values())
 
     def to_datatree(self, *, check_convergence: bool, report_level: str) -> DataTree:
-        """Make the DataTree of the results of all chains, and log what is to be said of them.
+        """Make the DataTree of all chains, and log their report and warnings.
 
-        The results are handed over: the draws are in memory twice, but never three times.
+        The task keeps no results: the draws are in memory twice, but never three times.
         """
         request, found, is_complete = self.request, None, self.is_complete
         with suppress(KeyboardInterrupt):
