@@ -1,5 +1,7 @@
 """Particles and draws that lie in different places are told apart, and which missed what."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -26,6 +28,29 @@ def compared(target, seed, *, of_particles=None, of_draws=None):
 @pytest.mark.parametrize("target", [UnequalWidths(8, 0.5), Skewed(8), Correlated(8)])
 def test_no_alarm_where_both_follow_the_posterior(target):
     assert not any(compared(target, seed) for seed in range(8))
+
+
+@pytest.mark.parametrize("is_labelled", [False, True])
+def test_populations_that_scatter_are_no_chains(is_labelled):
+    """Four in turn, one of which lies elsewhere by chance: as chains they would differ."""
+    target = Correlated(2)
+    rng = np.random.default_rng(5)
+    x = target.transport(rng.standard_normal((N_RUNS * N_PARTICLES, target.n_normals)))
+    particles = Particles(
+        x, target.prior.log_density(x), target.log_likelihood(x), np.arange(len(x))
+    )
+    posterior = target.posterior((4, 500), rng)
+    population = np.broadcast_to(np.arange(500) % 4, (4, 500))
+    sd = posterior.draws.std(axis=(0, 1))
+    draws = posterior.draws + 1.5 * sd * (population == 0)[..., None]
+    log_density = target.log_density(draws.reshape(2000, -1)).reshape(4, 500)
+    posterior = replace(
+        posterior,
+        draws=draws,
+        log_density=log_density,
+        population=population if is_labelled else None,
+    )
+    assert bool(compare_with_draws(particles, N_RUNS, posterior, rng)) is not is_labelled
 
 
 def test_a_mode_that_the_particles_have_missed():
