@@ -176,6 +176,7 @@ def _epidemic() -> Case:
         initial_dist=lambda: [pm.Poisson.dist(950.0), pm.Poisson.dist(40.0), 0],
         states=["S", "I", "cases"],
         accumulators=["cases"],
+        resets="row",
     )
     params, steps = {"rate": 0.7, "sigma": 0.3, "rho": 0.5}, np.array([3, 6, 9, 12, 15])
     observed = np.array([30.0, 60.0, np.nan, 70.0, 30.0])[:, None]
@@ -214,6 +215,7 @@ def _rate_and_total() -> Case:
         states=["rate", "total"],
         inputs=["push"],
         accumulators=["total"],
+        resets="row",
     )
     steps, push = np.array([0, 3, 4, 8, 11]), np.cos(np.arange(16.0))[:, None]
     observed = np.array([0.1, 1.9, np.nan, 2.5, 3.0])[:, None]

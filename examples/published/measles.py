@@ -94,6 +94,7 @@ def log_likelihood(town: str) -> tuple[float, float]:
         initial_cov=np.zeros((4, 4)),
         states=["susceptible", "exposed", "infectious", "recovered_this_week"],
         accumulators=("recovered_this_week",),
+        resets="row",
         inputs=["people", "births", "in_term", "school_starts"],
     )
     given = {name: fit[name] for name in seir.parameters}

@@ -17,6 +17,7 @@ from ..ops.base import evaluator
 from ..ops.states import FilterRun, ResumableRun, States
 from ..system.clock import Clock
 from ..system.given_record import GivenRecord
+from ..system.input_columns import resets_at, with_resets
 from ..system.model import StateSpaceModel
 from ..system.own_units import in_own_units, law_in_own_units, moments_of_members
 from ..system.panel import CheckedPanel, checked_panel
@@ -26,7 +27,7 @@ from ..system.record import CheckedRecord, check_seed, checked_record
 from ..system.steps import check_at, rows_at
 from .filter_warnings import warn_about, warn_of_choice
 
-STATE, _RECORD = "filter_state", "filter_state_record"
+STATE, _RECORD, _RESETS = "filter_state", "filter_state_record", "accumulators_reset"
 
 
 def run_filter(
@@ -154,12 +155,16 @@ def run_filter(
     axes = [table.axis] if isinstance(table, CheckedRecord) else table.axes
     ends = [float(axis.times(axis.steps[-1])) for axis in axes]
     clock = table.clock.stored() | {"ends": ends}
+    if system.accumulators:
+        clock[_RESETS] = np.concatenate([resets_at(system, each[2][-1]) for each in arguments])
     first = [np.int64(0)] * len(arguments)
     before = [np.empty(0)] * len(arguments)
     if state is not None:
         before = states_before(state, filter, common, labels)
         names = labels or [None]
-        arguments = [going_on(system, *each) for each in zip(arguments, before, names, strict=True)]
+        resets = np.reshape(state.attrs.get(_RESETS, ()), (len(names), -1))
+        each_one = zip(arguments, before, resets, names, strict=True)
+        arguments = [going_on(system, *one) for one in each_one]
         first = [np.int64(one[0]) + 1 for one in before]
     at_steps = [each[1] for each in arguments]
     rows = [own[own >= k] for own, k in zip((rows_at(at, s) for s in at_steps), first, strict=True)]
@@ -284,9 +289,16 @@ def states_before(
 
 
 def going_on(
-    system: StateSpaceModel, arguments: tuple, before: np.ndarray, label: Any = None
+    system: StateSpaceModel,
+    arguments: tuple,
+    before: np.ndarray,
+    resets: np.ndarray,
+    label: Any = None,
 ) -> tuple:
-    """The arguments of a run for the rows after an earlier one."""
+    """The arguments of a run for the rows after an earlier one.
+
+    ``resets`` tells which accumulators start anew after its last row.
+    """
     theta, steps, observed, inputs, *others = arguments
     last = int(before[0])
     if steps[0] <= last:
@@ -297,7 +309,7 @@ def going_on(
         )
     if system.accumulators:
         inputs = inputs.copy()
-        inputs[last, -1] = 1.0  # they start anew after the last old row
+        inputs[last] = with_resets(system, inputs[last], resets)
     return theta, steps, observed, inputs, *others
 
 

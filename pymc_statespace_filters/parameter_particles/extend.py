@@ -13,7 +13,7 @@ from ..pymc_model.inspection import given_model
 from ..system.checks import check_flag, check_random_seed
 from ..system.clock import times_of_data
 from ..system.given_record import GivenRecord
-from ..system.input_columns import inputs_of_user
+from ..system.input_columns import inputs_of_user, resets_at, with_resets
 from ..system.placement import Earlier
 from ..system.record import CheckedRecord, check_observed, checked_record
 from ..system.steps import GRID_TOLERANCE, check_steps
@@ -192,7 +192,6 @@ def _longer(rows: ObservedRows, new: CheckedRecord) -> Record:
                 f"{old[row].tolist()}, got {own[row].tolist()}"
             )
         inputs[:last] = seen.inputs[:last]
-        if system.accumulators:
-            inputs[last, -1] = 1.0  # they start anew after the last row seen
+        inputs[last] = with_resets(system, inputs[last], resets_at(system, seen.observed[-1]))
     steps = np.concatenate([seen.steps, new.axis.steps])
     return Record(steps, np.concatenate([seen.observed, new.observed]), inputs, seen.t0)

@@ -22,7 +22,7 @@ from ..ops.unplanned import cache_key, check_of_rows, end_of_record, single_reco
 from ..system.panel_records import FIRST_INPUT, RECORD, STEP
 from .held_seed import warn_of_held_seed
 from .inspection import state_space_nodes
-from .random_variable import PanelRV, StateSpaceRV, draw_in_python
+from .random_variable import PanelRV, StateSpaceRV, draw_in_python, inputs_as_seen
 from .sequential_terms import warn_of_stored_terms
 from .stepped import warn_of_steps
 from .unused_priors import warn_of_unused_priors
@@ -120,6 +120,7 @@ def _log_density(
     theta, steps, inputs, t0, seed = params
     _warn_about_model(op)
     warn_of_steps(op.system, theta)
+    inputs = inputs_as_seen(op, inputs, steps, value)
     likelihood = LogLikelihood(op.system, op.filter)
     terms = vectorized(likelihood, theta, steps, value, inputs, t0, seed)[0]
     if op.score_from == 0:
@@ -139,6 +140,7 @@ def _log_density_of_panel(
     theta, rows, inputs, t0, seed = params
     _warn_about_model(op)
     warn_of_steps(op.system, theta)
+    inputs = inputs_as_seen(op, inputs, rows, value)
     likelihood = LogLikelihood(op.system, op.filter, PANEL)
     terms = vectorized(likelihood, theta, rows, value, inputs, t0, seed)[0]
     if op.score_from == 0:

@@ -11,11 +11,15 @@ from typing import Any, Self
 
 import numpy as np
 import pytensor
+import pytensor.tensor as pt
 from pytensor.compile.sharedvalue import SharedVariable
+from pytensor.graph.basic import Constant, Variable
+from pytensor.graph.traversal import ancestors
 from pytensor.tensor.random.op import RandomVariable
 
 from ..filters.protocol import Filter
 from ..system.clock import Clock
+from ..system.input_columns import only_seen
 from ..system.model import StateSpaceModel
 from ..system.timed_inputs import TimedInputs
 
@@ -85,6 +89,14 @@ class PanelRV(StateSpaceRV):
 def draw_in_python(op: RandomVariable, rng: np.random.Generator, *arguments: Any) -> np.ndarray:
     """Draw data with a NumPy generator; arguments are the parameters and the batch shape."""
     raise NotImplementedError(f"no draw is registered for {op}")
+
+
+def inputs_as_seen(op: StateSpaceRV, inputs: Variable, steps: Variable, value: Variable) -> Any:
+    """The inputs of the variable where its data are ``value``, also if it was made without them."""
+    is_data = isinstance(value, Constant | SharedVariable) and value not in ancestors([inputs])
+    if not is_data or inputs.type.ndim != 2:
+        return inputs
+    return pt.as_tensor(only_seen(op.system, inputs, steps, value))
 
 
 def make_seed(name: str, seed: np.ndarray) -> SharedVariable:

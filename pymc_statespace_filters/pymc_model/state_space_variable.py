@@ -24,6 +24,7 @@ from ..system.clock import Clock
 from ..system.model import StateSpaceModel
 from ..system.timed_inputs import TimedInputs
 from .inspection import state_space_nodes
+from .random_variable import inputs_as_seen
 
 
 class StateSpaceVariable(NamedTuple):
@@ -62,8 +63,8 @@ def observed_variables(model: pm.Model) -> list[StateSpaceVariable]:
         if rv in model.observed_RVs:
             theta, steps, inputs, t0, seed = node.inputs[-5:]
             dims = model.named_vars_to_dims[name]
-            record = (theta, steps, inputs, t0, seed, model.rvs_to_values[rv])
-            op = node.op
+            op, value = node.op, model.rvs_to_values[rv]
+            record = (theta, steps, inputs_as_seen(op, inputs, steps, value), t0, seed, value)
             found.append(
                 StateSpaceVariable(
                     name, op.system, op.filter, dims, *record, op.score_from, op.clock, op.timed

@@ -17,7 +17,7 @@ from ..errors import ModelError
 from ..filters.ekf import EKF
 from ..filters.protocol import EnsembleFilter, Filter
 from ..filters.signatures import PANEL
-from ..system.input_columns import divided, without_resets
+from ..system.input_columns import divided, with_resets
 from ..system.integrators.substeps import CoupledNoise
 from ..system.model import StateSpaceModel
 from ..system.panel_records import FIRST_INPUT, RECORD, STEP
@@ -207,7 +207,7 @@ def path_eigenvalues(
     n_steps = min(int(steps.max(initial=0)) * substeps, MAX_STEPS)
     # The last row of a record at any times begins no step.
     n_rows = max(n_steps // substeps + (not system.is_at_any_times), 1)
-    rows = without_resets(system, inputs[:, :n_rows])
+    rows = with_resets(system, inputs[:, :n_rows], 0.0)
     inputs = divided(system, rows, substeps)
     x = start(theta)
     eigenvalues = []

@@ -15,6 +15,7 @@ from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.state_space_variable import observed_variables
 from ..system.checks import check_random_seed, is_integer
 from ..system.given_record import inputs_with_times
+from ..system.input_columns import only_seen
 from ..system.model import StateSpaceModel
 from ..system.own_units import in_own_units
 from ..system.placement import check_takes
@@ -49,7 +50,8 @@ def forecast(
     """Predict states and observations after the last observation, at draws of the posterior.
 
     For each draw, a state at the last observation is drawn and simulated forward with fresh process
-    and observation noise. Accumulators sum from one predicted step to the next.
+    and observation noise. Accumulators go on from where they were last seen, and from one predicted
+    step to the next.
 
     Parameters
     ----------
@@ -138,6 +140,7 @@ def forecast(
                 future, axes, at_draws.records, at_draws.generators(rng), strict=True
             ):
                 input_rows = record.inputs_until(axis)
+                input_rows = only_seen(system, input_rows, record.steps, record.observed)
                 initial.append(record.states("filtered", record.steps[-1:], own))
                 ahead = system if axis.starts is None else system.at_any_times
                 start = initial[-1].drawn[:, 0]

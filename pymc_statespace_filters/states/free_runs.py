@@ -20,6 +20,7 @@ from ..pymc_model.inspection import given_model
 from ..pymc_model.state_space_variable import observed_variables
 from ..system.checks import check_flag, check_random_seed, shortened
 from ..system.given_record import inputs_with_times
+from ..system.input_columns import only_seen
 from ..system.model import StateSpaceModel
 from ..system.own_units import in_own_units
 from ..system.placement import Placement, Timing, place_by
@@ -62,7 +63,7 @@ def free_run(
         each record, as in `StateSpace`.
     steps : array_like of int, shape (R,), optional
         When to predict an observation, from step 0 of the simulation on; by default the steps of
-        the variable's record. Accumulators sum from one of them to the next.
+        the variable's record. Accumulators sum from one of them to the next, as in the data there.
     times : array_like, shape (R,), optional
         The same as times, numbers or dates as those of the model. Give at most one of both.
     input_times, inputs_at
@@ -151,7 +152,8 @@ def free_run(
             "observed must be that of one variable: give var_name, one of "
             f"{[variable.name for variable in variables]}"
         )
-    is_own_run = inputs is None and steps is None and times is None
+    is_elsewhere = steps is not None or times is not None
+    is_own_run = inputs is None and not is_elsewhere
     is_compared = observed is not None or is_own_run
     dims = state_dims(observed_variables(model))
     parts = []
@@ -167,7 +169,8 @@ def free_run(
             ):
                 (axis,), system = one.axes, one.system
                 measured = _measured(record, observed, axis.steps) if is_compared else None
-                at = _At(system, axis.steps, _input_rows(record, one))
+                data = measured if is_elsewhere else record.observed
+                at = _At(system, axis.steps, _input_rows(record, one, data))
                 path, values = _simulate(at_draws, record, at, with_noise, own)
                 paths.append(path)
                 seen.append(values)
@@ -282,13 +285,17 @@ class _At(NamedTuple):
     rows: Array
 
 
-def _input_rows(record: RecordAtDraws, placed: Placement) -> Array:
-    """The input rows (draws or 1, rows, columns) of a run: those given, else the model's."""
+def _input_rows(record: RecordAtDraws, placed: Placement, data: Array | None) -> Array:
+    """The input rows (draws or 1, rows, columns) of a run: those given, else the model's.
+
+    Accumulators are set to zero where the ``data`` (R, p) have them, in every row without data.
+    """
     (axis,), (inputs,) = placed.axes, placed.inputs
     if inputs is None:
         rows = record.inputs_until(axis)
     else:
         rows = check_inputs(inputs, placed.system, axis)[None]
+    rows = only_seen(placed.system, rows, axis.steps, data)
     # A copy: the simulator would be compiled again for arrays of another layout.
     return np.array(rows, order="C")
 

@@ -26,6 +26,7 @@ from ..pymc_model.state_space_variable import (
     observed_variables,
     with_other_filter,
 )
+from ..system.input_columns import only_seen
 from ..system.panel import panel_inputs
 from ..system.panel_records import FIRST_INPUT, RECORD, STEP, records_of
 from ..system.record import check_inputs
@@ -95,10 +96,11 @@ class VariableAtDraws:
             records = records_of(table[:, RECORD])._replace(labels=own)
             rows, firsts = panel_inputs(inputs, system, records, axes)
             table[:, FIRST_INPUT] = 0 if firsts is None else firsts[records.of_rows()]
-            changed = variable._replace(inputs=pt.as_tensor(rows), steps=pt.as_tensor(table))
         else:
-            rows = check_inputs(inputs, system, axes[0])
-            changed = variable._replace(inputs=pt.as_tensor(rows))
+            rows, table = check_inputs(inputs, system, axes[0]), self.records[0].steps
+        observed = np.concatenate([record.observed for record in self.records])
+        rows = only_seen(system, rows, table, observed)
+        changed = variable._replace(inputs=pt.as_tensor(rows), steps=pt.as_tensor(table))
         return VariableAtDraws(self._model, changed, self.draws)
 
     def generators(self, rng: np.random.Generator) -> list[np.random.Generator]:

@@ -7,21 +7,24 @@ are, in this order,
   which it begins;
 * for each number of steps for which some drifting parameters are held, a one where they move at the
   end of the step, and a zero elsewhere;
-* of a system with accumulators a one where an observation begins the step, at which they are set to
-  zero, and a zero elsewhere.
+* for each accumulator a one where the step begins at an observation at which it is set to zero, and
+  a zero elsewhere.
 
 So filters, simulations and forecasts treat lengths, times and the rest as they treat inputs.
 Here these columns are made, read and hidden from the user.
 """
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pytensor.tensor as pt
-from pytensor.graph.basic import Variable
+from pytensor.graph.basic import Constant, Variable
 from pytensor.tensor.variable import TensorVariable
 
+from ..errors import INSIDE, ModelWarning
+from .panel_records import FIRST_INPUT, RECORD, STEP
 from .steps import GRID_TOLERANCE
 from .time_axis import TimeAxis
 
@@ -44,11 +47,11 @@ class InputRow(NamedTuple):
 
 
 def input_row(
-    n_inputs: int, *, at_any_times: bool, has_accumulators: bool, held_for: Sequence[int]
+    n_inputs: int, *, at_any_times: bool, n_accumulators: int, held_for: Sequence[int]
 ) -> InputRow:
     """The symbol of a row."""
     first_move = n_inputs + 2 * at_any_times
-    n_columns = first_move + len(held_for) + has_accumulators
+    n_columns = first_move + len(held_for) + n_accumulators
     u = pt.tensor("u", shape=(n_columns,), dtype="float64")
     of_user = u[:n_inputs] if n_columns > n_inputs else u
     moves = {every: u[first_move + i] for i, every in enumerate(held_for)}
@@ -61,14 +64,17 @@ def reset(
     x: TensorVariable, input_row: TensorVariable, accumulators: Sequence[int]
 ) -> TensorVariable:
     """The state from which a step begins, for the indices of the accumulators."""
-    for i in accumulators:
+    for column, i in enumerate(accumulators, -len(accumulators)):
         # A product, because a switch would count as an equation with a kink.
-        x = pt.set_subtensor(x[i], (1.0 - input_row[-1]) * x[i])
+        x = pt.set_subtensor(x[i], (1.0 - input_row[column]) * x[i])
     return x
 
 
 def with_columns(system: "StateSpaceModel", inputs: np.ndarray, axis: TimeAxis) -> np.ndarray:
-    """The user's inputs (..., rows, n_inputs) with all columns, of a record on this axis."""
+    """The user's inputs (..., rows, n_inputs) with all columns, of a record on this axis.
+
+    Accumulators are set to zero at every observation, until `only_seen` knows the data.
+    """
     columns = []
     if axis.lengths is not None and axis.starts is not None:
         columns += [axis.lengths, axis.starts]
@@ -78,7 +84,7 @@ def with_columns(system: "StateSpaceModel", inputs: np.ndarray, axis: TimeAxis) 
     if system.accumulators:
         at_observation = np.zeros(n_rows)
         at_observation[axis.steps[axis.steps < n_rows]] = 1.0
-        columns.append(at_observation)
+        columns += [at_observation] * len(system.accumulators)
     if not columns:
         return inputs
     own = np.stack(columns, axis=-1)
@@ -112,7 +118,7 @@ def with_symbolic_columns(
         steps = pt.as_tensor(steps)
         # Steps past the last row fall on one row more, which is cut off.
         ones = pt.set_subtensor(pt.zeros(n_rows + 1)[pt.clip(steps, 0, n_rows)], 1.0)
-        columns.append(ones[:-1])
+        columns += [ones[:-1]] * len(system.accumulators)
     if not columns:
         return inputs
     own = pt.stack(columns, axis=1)
@@ -136,11 +142,81 @@ def _moves(number: Any, every: int, axis: TimeAxis) -> Any:
     return np.asarray(np.floor(end) > np.floor(begin), dtype=np.float64)
 
 
-def without_resets(system: "StateSpaceModel", rows: np.ndarray) -> np.ndarray:
-    """Rows of a system's inputs (..., n_input_columns) at which no accumulator is set to zero."""
+def only_seen(system: "StateSpaceModel", inputs: Any, steps: Any, observed: Any) -> Any:
+    """Inputs (..., rows, n_input_columns) of which an accumulator is set to zero if it was seen.
+
+    That is, at those of the observations (J, p) that have an observable which reads it. ``steps``
+    are those of the observations, (J,) or the table of a panel (J, 3), which holds numbers.
+    """
+    n = len(system.accumulators)
+    if n == 0 or system.resets == "row" or observed is None:
+        return inputs
+    given = (inputs, steps, observed)
+    inputs, steps, observed = (v.data if isinstance(v, Constant) else v for v in given)
+    xp: Any = pt if any(isinstance(v, Variable) for v in (inputs, steps, observed)) else np
+    seen, n_rows = seen_accumulators(system, observed), inputs.shape[-2]
+    # Steps past the last row fall on one row more, which is cut off.
+    at = xp.clip(_rows_of(steps, n_rows), 0, n_rows)
+    kept = xp.ones((n_rows + 1, n))
+    if xp is np:
+        kept[at] = seen
+    else:  # data of other rows, where new ones are not set yet, say nothing
+        n_known = pt.switch(pt.eq(at.shape[0], seen.shape[0]), seen.shape[0], 0)
+        kept = pt.set_subtensor(kept[at[:n_known]], seen[:n_known])
+    return xp.concatenate([inputs[..., :-n], inputs[..., -n:] * kept[:-1]], axis=-1)
+
+
+def seen_accumulators(system: "StateSpaceModel", observed: Any) -> Any:
+    """Which accumulators (J, n) an observable reads that observations (J, p) have; 1 or 0."""
+    xp = pt if isinstance(observed, Variable) else np
+    is_there = (1 - xp.isnan(observed)) @ system.readers
+    return xp.minimum(is_there, 1).astype("float64")
+
+
+def resets_at(system: "StateSpaceModel", observed: np.ndarray) -> np.ndarray:
+    """Which accumulators (n,) are set to zero after an observation (p,); 1 or 0."""
+    if system.resets == "row":
+        return np.ones(len(system.accumulators))
+    return np.asarray(seen_accumulators(system, observed))
+
+
+def warn_of_gaps_in_sums(system: "StateSpaceModel", observed: np.ndarray) -> None:
+    """Warn where the user did not say whether sums go on over single gaps in the data (J, p)."""
+    if not system.accumulators or system.names_resets or not np.isnan(observed).any():
+        return
+    unseen = 1 - seen_accumulators(system, observed)
+    n_rows, missing = len(unseen), unseen.sum(axis=0).astype(int)
+    for name, n_missing in zip(system.accumulators, missing.tolist(), strict=True):
+        if 0 < n_missing < n_rows / 2:  # a sum of several rows is missing in most
+            warnings.warn(
+                f"{n_missing} of {n_rows} rows have no value of {name!r}, which sums on to the next"
+                " value: if a value counts since the row before it, as weekly cases do, give "
+                "StateSpaceModel(resets='row'); if it counts since the last value, give "
+                "resets='seen', which ends this warning",
+                ModelWarning,
+                skip_file_prefixes=INSIDE,
+            )
+
+
+def _rows_of(steps: Any, n_rows: Any) -> Any:
+    """The row of inputs of the step that begins at each observation; ``n_rows`` if there is none.
+
+    The records of a panel have stretches of their own, one behind the other.
+    """
+    if steps.ndim == 1:
+        return steps
+    is_first = np.diff(steps[:, RECORD], prepend=steps[0, RECORD] - 1) != 0
+    begins, ends = steps[is_first, FIRST_INPUT], np.append(steps[is_first, FIRST_INPUT][1:], n_rows)
+    number = np.cumsum(is_first) - 1
+    rows = begins[number] + steps[:, STEP]
+    return np.where(rows < ends[number], rows, n_rows)
+
+
+def with_resets(system: "StateSpaceModel", rows: np.ndarray, resets: Any) -> np.ndarray:
+    """Rows of inputs (..., n_input_columns) with these numbers in the columns of accumulators."""
     rows = rows.copy()
     if system.accumulators:
-        rows[..., -1] = 0.0
+        rows[..., -len(system.accumulators) :] = resets
     return rows
 
 
@@ -170,8 +246,9 @@ def divided(system: "StateSpaceModel", rows: Any, factor: int) -> Any:
     is_last = xp.eq(number, factor - 1) if xp is pt else number == factor - 1
     for i in range(first_move, first_move + len(system.held_for)):
         columns[i] = columns[i] * is_last
-    if system.accumulators:  # a step, not each of its parts, begins with a reset
-        columns[-1] = columns[-1] * xp.eq(number, 0) if xp is pt else columns[-1] * (number == 0)
+    is_first = xp.eq(number, 0) if xp is pt else number == 0
+    for i in range(-len(system.accumulators), 0):  # a step, not each of its parts
+        columns[i] = columns[i] * is_first
     return xp.stack(columns, axis=-1) if columns else repeated
 
 

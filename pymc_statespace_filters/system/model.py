@@ -5,11 +5,14 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
+import numpy as np
+
 from ..errors import ModelError
 from .drift import DriftingParameter, held_for
 from .graph_digest import describe, digest
 from .integrators.protocol import Integrator, bound_to_states
 from .labels import default_names
+from .readers import observables_that_read
 from .signature import checked_names, names_of_states, read_signature, size_of
 from .tracing import INPUT_ROW, Equations, read, size, trace
 
@@ -69,8 +72,12 @@ class StateSpaceModel:
     carried : sequence of str
         States that no Kalman update touches (discrete memory); copied with their particle.
     accumulators : sequence of str
-        States that are zero again right after every observation (missing ones too), such as the
-        cases of a week. At an observation a state has its value before that.
+        States that are zero again right after an observation, such as the cases of a week. At an
+        observation a state has its value before that.
+    resets : {"seen", "row"}
+        When that is: where an observable that depends on the accumulator is not missing, the
+        default, for a value that counts all since the last one, as a quarterly sum among months;
+        or in every row, also one of NaN, for a value that counts since the row before.
 
     Raises
     ------
@@ -113,6 +120,7 @@ class StateSpaceModel:
         shapes: Mapping[str, Sequence[int]] | None = None,
         carried: Sequence[str] = (),
         accumulators: Sequence[str] = (),
+        resets: str | None = None,
     ) -> None:
         self._trace(
             {
@@ -134,6 +142,7 @@ class StateSpaceModel:
             shapes=shapes,
             carried=carried,
             accumulators=accumulators,
+            resets=resets,
         )
 
     def _trace(
@@ -146,6 +155,7 @@ class StateSpaceModel:
         shapes: Mapping[str, Sequence[int]] | None,
         carried: Sequence[str],
         accumulators: Sequence[str],
+        resets: str | None,
         drifting: Sequence[DriftingParameter] = (),
         at_any_times: bool = False,
     ) -> None:
@@ -156,7 +166,7 @@ class StateSpaceModel:
             functions,
             signature,
             drifting,
-            has_accumulators=bool(accumulators),
+            n_accumulators=len(accumulators),
             at_any_times=at_any_times,
         )
         state_names = checked_names("states", states, default_names("x", symbols.n_written))
@@ -183,6 +193,7 @@ class StateSpaceModel:
             inputs=signature.inputs,
             carried=names_of_states("carried", carried, state_names),
             accumulators=totals,
+            resets=_checked_resets(resets),
             drifting=tuple(drifting),
             additive_noise=seen.additive,
             discrete_noise=symbols.drawn is not None and symbols.drawn.is_discrete,
@@ -199,6 +210,7 @@ class StateSpaceModel:
             "shapes": shapes,
             "carried": carried,
             "accumulators": accumulators,
+            "resets": resets,
             "drifting": drifting,
         }
         # To trace it again, with another integrator or at any times: neither compared nor pickled.
@@ -219,6 +231,7 @@ class StateSpaceModel:
     inputs: tuple[str, ...]
     carried: tuple[str, ...]
     accumulators: tuple[str, ...]
+    resets: str
     drifting: tuple[DriftingParameter, ...]
     additive_noise: bool
     discrete_noise: bool
@@ -385,8 +398,18 @@ class StateSpaceModel:
     @property
     def is_at_any_times(self) -> bool:
         """Whether length and time of a step are columns of inputs."""
-        other = len(self.held_for) + bool(self.accumulators)
+        other = len(self.held_for) + len(self.accumulators)
         return self.n_input_columns > self.n_inputs + other
+
+    @property
+    def names_resets(self) -> bool:
+        """Whether the user said when accumulators are reset."""
+        return self.__dict__.get("_settings", {}).get("resets", "") is not None
+
+    @cached_property
+    def readers(self) -> np.ndarray:
+        """Which observables (p, accumulators) read an accumulator, see `observables_that_read`."""
+        return observables_that_read(self, [self.states.index(a) for a in self.accumulators])
 
     @property
     def held_for(self) -> tuple[int, ...]:
@@ -402,3 +425,9 @@ class StateSpaceModel:
     def fingerprint(self) -> str:
         """A digest of the equations and settings, the same in every process."""
         return digest(describe(self))
+
+
+def _checked_resets(resets: Any) -> str:
+    if resets not in (None, "seen", "row"):
+        raise ModelError(f"resets must be 'seen' or 'row', got {resets!r}")
+    return resets or "seen"

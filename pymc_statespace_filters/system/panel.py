@@ -21,6 +21,7 @@ from pytensor.tensor.variable import TensorVariable
 from ..errors import ModelError
 from .clock import Clock
 from .given_record import GivenRecord, own_inputs
+from .input_columns import only_seen
 from .model import StateSpaceModel
 from .panel_records import FIRST_INPUT, STEP, Records, records_of
 from .placement import Earlier
@@ -171,6 +172,8 @@ def checked_panel(
     number, at = records.of_rows(), np.concatenate([axis.steps for axis in placed.axes])
     begin = np.zeros_like(at) if first_inputs is None else first_inputs[number]
     rows = np.stack([records.codes[number], at, begin], axis=1)
+    if given.observed is not None:
+        forces = only_seen(system, forces, rows, data)
     return CheckedPanel(placed.system, placed.clock, records, placed.axes, rows, data, forces)
 
 
@@ -204,6 +207,7 @@ def symbolic_panel(system: StateSpaceModel, given: GivenRecord) -> SymbolicPanel
     rows: Any = pt.stack([pt.cast(pt.as_tensor(column), "int64") for column in columns], axis=1)
     if not any(isinstance(part, Variable) for part in (panel, steps, first_inputs)):
         rows = rows.eval(mode="FAST_COMPILE")
+    forces = only_seen(system, forces, rows, data)
     return SymbolicPanel(
         system, placed.clock, axes, records, n_records, rows, data, forces, placed.timed
     )

@@ -15,7 +15,13 @@ from ..errors import ModelError
 from .checks import check_floats, shortened
 from .clock import Clock
 from .given_record import GivenRecord
-from .input_columns import n_input_rows, with_columns, with_symbolic_columns
+from .input_columns import (
+    n_input_rows,
+    only_seen,
+    warn_of_gaps_in_sums,
+    with_columns,
+    with_symbolic_columns,
+)
 from .labels import columns_in_order
 from .model import StateSpaceModel
 from .placement import Earlier
@@ -53,6 +59,8 @@ def checked_record(
     (axis,), (rows,) = placed.axes, placed.inputs
     data = checked_data(given.observed, system, axis.steps.size)
     rows = check_inputs(rows, placed.system, axis)
+    if given.observed is not None:
+        rows = only_seen(system, rows, axis.steps, data)
     return CheckedRecord(placed.system, placed.clock, axis, data, rows)
 
 
@@ -73,13 +81,15 @@ def symbolic_record(system: StateSpaceModel, given: GivenRecord) -> SymbolicReco
     placed = given.current().placed(system)
     (axis,), (rows,) = placed.axes, placed.inputs
     steps = given.steps if isinstance(given.steps, Variable) else axis.steps
+    data = symbolic_data(given.observed, system, axis.steps.size)
+    inputs = _symbolic_inputs(rows, placed.system, steps, axis)
     return SymbolicRecord(
         placed.system,
         placed.clock,
         axis,
         steps,
-        symbolic_data(given.observed, system, axis.steps.size),
-        _symbolic_inputs(rows, placed.system, steps, axis),
+        data,
+        only_seen(system, inputs, steps, data),
         placed.timed,
     )
 
@@ -90,14 +100,14 @@ def symbolic_data(observed: Any, system: StateSpaceModel, n_rows: int) -> Variab
         return None
     if not isinstance(observed, Variable):
         # A symbol, because PyMC would mask and impute the NaN of an array.
-        return pt.as_tensor(check_observed(observed, system, n_rows))
+        return pt.as_tensor(checked_data(observed, system, n_rows))
     if observed.type.ndim != 2:
         raise ModelError(
             "observed must have 2 dimensions (rows, observables) if it is symbolic, as pm.Data is, "
             f"got {observed.type.ndim}: for one observable give it values[:, None]"
         )
     if isinstance(observed, SharedVariable):
-        check_observed(observed.get_value(), system, n_rows)
+        checked_data(observed.get_value(), system, n_rows)
     return observed
 
 
@@ -141,7 +151,9 @@ def checked_data(observed: Any, system: StateSpaceModel, n_rows: int) -> np.ndar
     """The data (J, p), all missing in a simulation."""
     if observed is None:
         return np.full((n_rows, system.p), np.nan)
-    return check_observed(observed, system, n_rows)
+    data = check_observed(observed, system, n_rows)
+    warn_of_gaps_in_sums(system, data)
+    return data
 
 
 def check_observed(observed: Any, system: StateSpaceModel, n_observations: int) -> np.ndarray:

@@ -194,7 +194,7 @@ def size(
     signature: Signature,
     drifting: Sequence[DriftingParameter] = (),
     *,
-    has_accumulators: bool = False,
+    n_accumulators: int = 0,
     at_any_times: bool = False,
 ) -> Symbols:
     """Make the symbols, parameters first: the lengths of the others depend on them."""
@@ -205,7 +205,7 @@ def size(
     row = input_row(
         len(signature.inputs),
         at_any_times=at_any_times,
-        has_accumulators=has_accumulators,
+        n_accumulators=n_accumulators,
         held_for=held_for(drifting),
     )
     time = pt.tensor("t", shape=(), dtype="float64")

@@ -15,6 +15,7 @@ SYSTEM = psf.StateSpaceModel(
     initial_cov=[[1.0, 0.0], [0.0, 0.0]],
     inputs=["force"],
     accumulators=["x1"],
+    resets="row",
 )
 RNG = np.random.default_rng(1)
 STEPS = np.array([0, 2, 3, 7, 8, 12, 15])

@@ -80,9 +80,9 @@ def test_predictions_of_the_component_that_is_there_are_scored():
     np.testing.assert_array_equal(np.isnan(found["d_residual"]), np.isnan(DATA))
 
 
-def test_a_partly_missing_row_ends_a_sum():
-    """The sum begins anew behind it, as behind a whole row: by hand, without noise."""
-    system = psf.StateSpaceModel(
+def test_a_partly_missing_row_ends_a_sum_that_it_has_or_that_counts_rows():
+    """By hand, without noise: the sum is missing in the first row."""
+    system = dict(
         transition=lambda x: [x[0], x[1] + x[0]],
         observation_dist=lambda x: [
             pm.Normal.dist(mu=x[0], sigma=1.0),
@@ -92,7 +92,9 @@ def test_a_partly_missing_row_ends_a_sum():
         initial_cov=[[0.0, 0.0], [0.0, 0.0]],
         accumulators=["x1"],
     )
-    observed = np.array([[2.5, np.nan], [np.nan, 4.0]])
-    terms = psf.log_likelihood(system, psf.EKF(), {}, observed, steps=[3, 5])
-    expected = [stats.norm.logpdf(2.5, 2.0), stats.norm.logpdf(4.0, 2 * 2.0)]
-    np.testing.assert_allclose(terms, expected, rtol=1e-12)
+    observed = np.array([[2.5, np.nan], [np.nan, 9.0]])
+    for resets, n_steps in ((None, 5), ("seen", 5), ("row", 2)):
+        own = psf.StateSpaceModel(**system, resets=resets)
+        terms = psf.log_likelihood(own, psf.EKF(), {}, observed, steps=[3, 5])
+        expected = [stats.norm.logpdf(2.5, 2.0), stats.norm.logpdf(9.0, n_steps * 2.0)]
+        np.testing.assert_allclose(terms, expected, rtol=1e-12)

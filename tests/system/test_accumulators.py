@@ -41,6 +41,7 @@ def rate_and_total(**changes):
         states=["rate", "total"],
         inputs=["push"],
         accumulators=["total"],
+        resets="row",
     )
     return psf.StateSpaceModel(**settings | changes)
 
@@ -128,7 +129,7 @@ def test_a_grid_is_set_to_one_point():
     system = psf.StateSpaceModel(
         transition=lambda x, q: [x[0] + 0.5 + q[0]], process_noise=[[0.3]],
         observation=lambda x: [x[0]], observation_noise=[[0.2]],
-        initial_mean=[0.3], initial_cov=[[0.2]], accumulators=["x0"],
+        initial_mean=[0.3], initial_cov=[[0.2]], accumulators=["x0"], resets="row",
     )  # fmt: skip
     lengths = np.diff(STEPS)
     means, variances = np.r_[0.3, 0.5 * lengths], np.r_[0.2, 0.3 * lengths] + 0.2

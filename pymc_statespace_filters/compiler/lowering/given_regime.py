@@ -58,7 +58,6 @@ def given_regime(model: StateSpaceModel, found: FiniteStates) -> StateSpaceModel
         n=len(states), states=names, n_inputs=model.n_inputs + n_more,
         inputs=(*model.inputs, *columns), discrete_noise=False, keeps_noises=True,
         carried=tuple(name for name in model.carried if name in names),
-        accumulators=tuple(name for name in model.accumulators if name in names),
         observation_uses_inputs=True,
     )  # fmt: skip
 
