@@ -1,5 +1,6 @@
-"""Test whether several estimates of one evidence agree, and diagnose a disagreement."""
+"""Which of several estimates of one evidence is taken, and whether the others agree with it."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations
@@ -15,6 +16,8 @@ NEGLIGIBLE = 0.05  # nats
 _SMALLEST_ERROR = 1e-6  # avoids division by zero: an estimate may be exact
 
 FROM_PRIOR = ("prior_monte_carlo", "tempered_smc")
+# Bridge sampling uses all draws at once, Chib and Jeliazkov's ordinate those near one point.
+ESTIMATE, CHECK = "bridge", "chib_jeliazkov"
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,20 @@ class Agreement:
 
     def __bool__(self) -> bool:
         return not self.diagnosis
+
+
+def chosen_estimator(evidences: Mapping[str, Evidence]) -> str:
+    """The estimator whose estimate is taken; the others check it.
+
+    That is "bridge", unless it has no standard error, or doubts that another estimator has not;
+    "chib_jeliazkov" only where there is no other.
+    """
+
+    def uncertainty(name: str) -> tuple[bool, bool, bool, bool, float]:
+        one = evidences[name]
+        return math.isnan(one.se), name == CHECK, bool(one.doubts), name != ESTIMATE, one.se
+
+    return min(evidences, key=uncertainty)
 
 
 def assess_agreement(evidences: Mapping[str, Evidence]) -> Agreement:
@@ -77,6 +94,8 @@ def _diagnose(evidences: Mapping[str, Evidence]) -> str:
         )
     elif all(from_prior):
         cause = "the posterior is too narrow relative to the prior for prior_monte_carlo"
+    elif doubtful := _doubtful(low, high):
+        cause = doubtful
     else:
         cause = (
             "the draws are too few, or the posterior is far from the shape that the estimators "
@@ -85,6 +104,15 @@ def _diagnose(evidences: Mapping[str, Evidence]) -> str:
             "that both have missed remains unknown"
         )
     return f"{gap}; {cause}"
+
+
+def _doubtful(*pair: Evidence) -> str:
+    """That the error of one of two estimates is in doubt, first of all that of the check."""
+    check, other = sorted(pair, key=lambda one: one.estimator != CHECK)
+    for one, doubts_of_other in ((check, other.doubts), (other, check.doubts)):
+        if own := [doubt for doubt in one.doubts.split("; ") if doubt not in doubts_of_other]:
+            return f"the error of {one.estimator} is in doubt: {'; '.join(own)}"
+    return ""
 
 
 def _distance(pair: tuple[Evidence, Evidence]) -> float:

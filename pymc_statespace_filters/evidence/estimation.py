@@ -267,10 +267,12 @@ def estimate_evidence(
     Warns
     -----
     EvidenceWarning
-        If an estimate may be unreliable; if its standard error stays above `target_se`, with the
-        number of draws that would do or another remedy; if an estimator cannot treat the model and
-        is missing from the result; or if the estimates disagree, with p < 0.001 by Cochran's
-        chi-square test and by more than 0.05 nats. The warning states the likely cause.
+        If the estimate that `compare_evidence` takes by default ("bridge", if it is made) may be
+        unreliable, or its standard error stays above `target_se`, with the number of draws that
+        would do or another remedy; doubts about the others are in the result. If an estimator
+        cannot treat the model and is missing from the result; or if the estimates disagree, with
+        p < 0.001 by Cochran's chi-square test and by more than 0.05 nats. The warning states the
+        likely cause.
 
     Notes
     -----

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 from zlib import crc32
@@ -24,6 +24,7 @@ from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.posterior_draws import are_populations, noise_was_moved, posterior_group
 from ..pymc_model.prior import Support
 from ..unvisited.sentences import stored, unvisited
+from .agreement import chosen_estimator
 from .checks import check_convergence, check_discretisation
 from .estimators.maximum_likelihood import N_EVALUATIONS, max_log_likelihood
 from .estimators.protocol import Estimate, Estimator, uses_draws
@@ -64,9 +65,9 @@ def run_estimators(
     Warns
     -----
     EvidenceWarning
-        Once for all problems that do not depend on the estimator, once for estimates that rest on
-        chains that disagree, once for each unreliable estimate, and once for each estimator that
-        cannot treat the model while another can.
+        Once for all problems that do not depend on the estimator; once if the chains disagree, and
+        once if the error is doubtful or too large, both of the estimate that is taken; and once for
+        each estimator that cannot treat the model while another can.
     """
     model = model_of_draws(model, idata)
     posterior_group(idata)  # fails early, before anything is compiled
@@ -103,25 +104,27 @@ def run_estimators(
         if exact is None:
             estimates = _where_reached(estimates, estimators, posterior, largest.point, rng)
 
-    _warn(LESS_CERTAIN.format("the log-evidence"), common)
     rest_on_draws = [one.name for one in estimators if one.name in estimates and uses_draws(one)]
-    if rest_on_draws:
-        of_which = f"the log-evidence from draws ({', '.join(rest_on_draws)})"
-        _warn(LESS_CERTAIN.format(of_which), of_chains)
-    for name, refusal in refusals.items():
-        _warn(f"no estimate by {name}", [str(refusal)])
     of_model = _model_fields(model, posterior, support)
     of_model |= {"max_log_likelihood": largest.log_likelihood, "noise": noise}
     of_model["approximate"] = not (exactness(model) if exact is None else exact.is_exact)
     found = {}
     for name, estimate in estimates.items():
-        for message, reasons in _problems(name, estimate):
-            _warn(message, reasons)
         doubts = (*common, *(of_chains if name in rest_on_draws else ()), *estimate.doubts)
         numbers = estimate.log_evidence, estimate.se
         found[name] = Evidence(*numbers, name, doubts="; ".join(doubts), **of_model)
         if extend_inferencedata:
             store_evidence(idata, found[name], dict(estimate.settings))
+    # The others check the one that is taken: what is doubtful about them is in the result alone.
+    taken = chosen_estimator(found)
+    _warn(LESS_CERTAIN.format("the log-evidence"), common)
+    if taken in rest_on_draws:
+        of_which = f"the log-evidence from draws ({', '.join(rest_on_draws)})"
+        _warn(LESS_CERTAIN.format(of_which), of_chains)
+    for name, refusal in refusals.items():
+        _warn(f"no estimate by {name}", [str(refusal)])
+    by_name = {one.name: one for one in estimators}
+    _warn(*_problem(by_name[taken], estimates[taken]))
     return found
 
 
@@ -163,13 +166,16 @@ def _where_reached(
     }
 
 
-def _problems(name: str, estimate: Estimate) -> Iterator[tuple[str, Sequence[str]]]:
-    """The warnings about one estimate, each a message and its reasons, which may be none."""
-    number = f"log-evidence {estimate.log_evidence:.2f} ({name})"
-    yield LESS_CERTAIN.format(number), estimate.doubts
-    if estimate.shortfall:
-        error = f"has a standard error of {estimate.se:.2g}, above target_se"
-        yield f"{number} {error}", [estimate.shortfall]
+def _problem(estimator: Estimator, estimate: Estimate) -> tuple[str, Sequence[str]]:
+    """The warning about one estimate: a message and its reasons, which may be none."""
+    number = f"log-evidence {estimate.log_evidence:.2f} ({estimator.name})"
+    message = LESS_CERTAIN.format(number) if estimate.doubts else number
+    if not estimate.shortfall:
+        return message, estimate.doubts
+    target = getattr(estimator, "target_se", None)
+    above = "target_se" if target is None else f"target_se={target:g}"
+    error = f"its standard error of {estimate.se:.2g} is above {above} ({estimate.shortfall})"
+    return message, [*estimate.doubts, error]
 
 
 def _model_fields(model: pm.Model, posterior: Posterior, support: Support) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from pymc_statespace_filters.evidence.agreement import assess_agreement
 from pymc_statespace_filters.evidence.estimation import ESTIMATORS, EvidenceEstimates
 from pymc_statespace_filters.evidence.estimators.bridge import Bridge
 from pymc_statespace_filters.evidence.estimators.protocol import Estimate, Estimator
+from tests.evidence.analytic import Regression
 from tests.evidence.test_models import REGRESSION, exact_draws
 
 ALL = tuple(ESTIMATORS)
@@ -93,10 +94,9 @@ class LaplaceFromDraws:
 
 def test_an_estimator_from_outside(idata, model):
     idata = xr.DataTree.from_dict({"posterior": idata["posterior"].to_dataset()})
-    with pytest.warns(EvidenceWarning, match="a rough check"):
-        found = psf.estimate_evidence(
-            idata, model, estimators=["bridge", LaplaceFromDraws()], random_seed=5
-        )
+    found = psf.estimate_evidence(
+        idata, model, estimators=["bridge", LaplaceFromDraws()], random_seed=5
+    )
     assert list(found) == ["bridge", "laplace_from_draws"]
     evidence = found["laplace_from_draws"]
     assert evidence.log_evidence == pytest.approx(REGRESSION.log_evidence, abs=0.1)
@@ -106,6 +106,20 @@ def test_an_estimator_from_outside(idata, model):
         idata, model, estimators=Bridge(), random_seed=5, extend_inferencedata=False
     )
     assert alone["bridge"] == found["bridge"]
+
+
+def test_doubts_about_the_check_are_in_the_result_alone():
+    """500 draws of 20 parameters are too few for Chib and Jeliazkov's ordinate, not for bridge."""
+    regression = Regression(20, 40, np.random.default_rng(2))
+    w = regression.posterior((4, 125), np.random.default_rng(52), correlation=0.5).draws
+    idata = az.from_dict({"posterior": {"w": w}})
+    found = psf.estimate_evidence(idata, regression.model(), random_seed=2)
+    assert "effective draws, fewer than 100" in found["chib_jeliazkov"].doubts
+    assert found["chib_jeliazkov"].doubts in repr(found)
+    row = psf.compare_evidence({"a": idata}).loc["a"]
+    assert row["se"] == found["bridge"].se < 0.05
+    assert abs(row["log_evidence"] - regression.log_evidence) < 4 * row["se"]
+    assert not row["warning"]
 
 
 def test_every_built_in_estimator_satisfies_the_protocol():

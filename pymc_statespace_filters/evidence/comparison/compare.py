@@ -46,10 +46,11 @@ def compare_evidence(
     ci_prob : float
         Probability of the intervals.
     estimator : str, optional
-        Estimator whose evidences are compared, such as ``"bridge"``, if the models have several. By
-        default the estimates of each model must agree. Of the estimators that all models with
-        several have, the one with the smallest standard errors is then taken, of those whose
-        estimates have no ``doubts`` if there are any.
+        Estimator whose evidences are compared, such as ``"importance"``, if the models have
+        several. By default "bridge"; of a model that has no such estimate, or doubts about it
+        alone, the one with the smallest standard error, of those without ``doubts`` if there are
+        any. "chib_jeliazkov" is taken where there is no other. Estimates that disagree with the
+        one that is taken are a warning about it.
     step_errors : mapping of str to pandas.DataFrame, optional
         Tables of `step_error` by model, for the columns ``step_error`` and ``step_error_se``.
 
@@ -88,8 +89,8 @@ def compare_evidence(
             not below 1, so that the category is conservative. "negative" if the evidence favours
             this row, and only the prior places it below the first. Empty for the first row.
         ``warning``
-            Whether the evidence has ``doubts``, no standard error, an improper prior, or chains
-            that held a noise seed, whose error ``se`` excludes.
+            Whether the evidence has ``doubts``, other estimates that disagree with it, no standard
+            error, an improper prior, or chains that held a noise seed, whose error ``se`` excludes.
         ``max_log_likelihood``
             The largest log-likelihood found, as in `Evidence`.
         ``approximate``
@@ -106,8 +107,8 @@ def compare_evidence(
     Raises
     ------
     ModelError
-        If an argument is invalid; if no estimator is chosen and several estimates of a model
-        disagree, or none of them has a standard error.
+        If an argument is invalid; if no estimator is chosen and none of several estimates of a
+        model has a standard error.
     DataMismatchError
         If the models belong to different data.
 

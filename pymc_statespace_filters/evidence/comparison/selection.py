@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import log_softmax
 
 from ...errors import DataMismatchError, ModelError
-from ..agreement import assess_agreement
+from ..agreement import assess_agreement, chosen_estimator
 from ..evidence import Evidence, stored_evidences
 
 N_NORMALS = 50_000
@@ -83,15 +84,15 @@ class Selection(NamedTuple):
 def select_evidences(given: Mapping[str, EvidenceLike], estimator: str | None = None) -> Selection:
     """Select one evidence for each model, and check that all belong to the same data.
 
-    Without the name of an estimator, the estimates of a model must agree. Taken is then that of the
-    estimator with the smallest standard errors, of those that all models with several estimates
-    have, and of those without doubts if there are any. Estimates from the same draws have errors in
-    common, so that a combination of them would be no more certain.
+    Without the name of an estimator, it is that of `chosen_estimator`, with a doubt if other
+    estimates of the model disagree. Estimates from the same draws have errors in common, so that a
+    combination of them would be no more certain.
 
     Raises
     ------
     ModelError
-        If an entry is of another type, or the estimator is ambiguous or missing.
+        If an entry is of another type, the estimator is missing, or several estimates of a model
+        have no standard error.
     DataMismatchError
         If the models belong to different data.
     """
@@ -102,7 +103,7 @@ def select_evidences(given: Mapping[str, EvidenceLike], estimator: str | None = 
         )
     found = {name: _by_estimator(name, one) for name, one in given.items()}
     if estimator is None:
-        selection = _agreeing(found)
+        selection = _selected(found)
     else:
         chosen = {name: _named(name, one, estimator) for name, one in found.items()}
         selection = Selection(chosen, "")
@@ -138,54 +139,26 @@ def _named(name: str, found: ByEstimator, estimator: str) -> Evidence:
     return found[estimator]
 
 
-def _agreeing(found: Mapping[str, ByEstimator]) -> Selection:
-    """One evidence for each model, from estimates that agree."""
-    several = {name: _tested(name, one) for name, one in found.items() if len(one) > 1}
-    single = {name: one for name, by in found.items() if len(by) == 1 for one in by.values()}
-    if not several:
-        return Selection(single, "")
-    estimators = list(dict.fromkeys(one for by in several.values() for one in by))
-    common = [one for one in estimators if all(one in by for by in several.values())]
-    if common:
-        best = _most_certain(common, list(several.values()))
-        chosen = {name: by[best] for name, by in several.items()}
-        whose = f" of {', '.join(map(repr, several))}" if single else ""
-        sentence = f"Log-evidences{whose} by {best}"
-    else:
-        chosen = {name: by[_most_certain(list(by), [by])] for name, by in several.items()}
-        each = ", ".join(f"of {name!r} by {one.estimator}" for name, one in chosen.items())
-        sentence = f"Log-evidences {each}"
-    reason = "the only estimates with a standard error"
+def _selected(found: Mapping[str, ByEstimator]) -> Selection:
+    """One evidence for each model, with a doubt where its other estimates disagree."""
+    evidences = {name: _trusted(name, by) for name, by in found.items()}
+    several = [name for name, by in found.items() if len(by) > 1]
+    estimators = dict.fromkeys(evidences[name].estimator for name in several)
     if len(estimators) > 1:
-        reason = f"the smallest standard errors of estimates that agree ({', '.join(estimators)})"
-    return Selection({name: (single | chosen)[name] for name in found}, f"{sentence}, {reason}.")
+        each = ", ".join(f"of {name!r} by {evidences[name].estimator}" for name in several)
+    else:
+        whose = f"of {', '.join(map(repr, several))} " if len(several) < len(found) else ""
+        each = f"{whose}by {next(iter(estimators), '')}"
+    return Selection(evidences, f"Log-evidences {each}." if several else "")
 
 
-def _tested(name: str, found: ByEstimator) -> ByEstimator:
-    """The estimates with a standard error; a `ModelError` if there are none or they disagree."""
-    choose = f"choose one of {list(found)} by estimator="
-    tested = {one: evidence for one, evidence in found.items() if not math.isnan(evidence.se)}
-    if not tested:
-        doubts = "; ".join(dict.fromkeys(one.doubts for one in found.values() if one.doubts))
+def _trusted(name: str, by: ByEstimator) -> Evidence:
+    taken = by[chosen_estimator(by)]
+    if len(by) > 1 and math.isnan(taken.se):
+        doubts = "; ".join(dict.fromkeys(one.doubts for one in by.values() if one.doubts))
         raise ModelError(
-            f"{name!r} has estimates by several estimators, none of them with a standard error, so "
-            f"that their agreement is unknown: {choose}{f' ({doubts})' if doubts else ''}"
+            f"{name!r} has estimates by several estimators, none of them with a standard error: "
+            f"choose one of {list(by)} by estimator={f' ({doubts})' if doubts else ''}"
         )
-    agreement = assess_agreement(tested)
-    if not agreement:
-        raise ModelError(
-            f"{name!r} has estimates by several estimators that disagree: {agreement.diagnosis}. "
-            f"Remove the cause, or {choose}"
-        )
-    return tested
-
-
-def _most_certain(estimators: list[str], of_models: list[ByEstimator]) -> str:
-    """The estimator with the fewest doubts about its estimates, and then the smallest errors."""
-
-    def uncertainty(estimator: str) -> tuple[int, float]:
-        estimates = [by[estimator] for by in of_models]
-        doubtful = sum(bool(one.doubts) for one in estimates)
-        return doubtful, math.hypot(*(one.se for one in estimates))
-
-    return min(estimators, key=uncertainty)
+    doubts_of_taken = taken.doubts, assess_agreement(by).diagnosis
+    return replace(taken, doubts="; ".join(filter(None, doubts_of_taken)))
