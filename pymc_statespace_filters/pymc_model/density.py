@@ -23,7 +23,7 @@ from ..compiler.native.compilation import COMPILATION, undamaged_files, warning_
 from ..compiler.native.rows import Rows
 from ..errors import ModelError
 from .graph_rewrites import smooth_filters, with_filter
-from .inspection import noise_seeds
+from .inspection import check_observed, noise_seeds
 from .written_function import native_function
 
 Array = NDArray[np.float64]
@@ -88,7 +88,8 @@ class ConstrainedValues:
 
 
 def check_free_variables(model: pm.Model) -> None:
-    """Raise unless a model has free variables, all of them continuous."""
+    """Raise unless a model has free variables, all of them continuous, and none without data."""
+    check_observed(model)
     if model.discrete_value_vars:
         names = [model.values_to_rvs[value].name for value in model.discrete_value_vars]
         raise ModelError(

@@ -24,6 +24,7 @@ from ..system.parameters import check_names, symbolic_panel_parameters, symbolic
 from ..system.record import check_seed, symbolic_record
 from ..system.timed_inputs import TimedInputs
 from . import dispatch as dispatch  # registers draw and density
+from .missing_codes import warn_of_missing_codes
 from .random_variable import NUMBERS, PanelRV, StateSpaceRV, make_seed
 from .record_dimensions import in_order_of_records
 from .unused_priors import warn_of_no_data
@@ -185,6 +186,7 @@ class StateSpace(Continuous):
         if seed_array.ndim:
             raise ModelError(f"seed must be one integer, got an array of shape {seed_array.shape}")
         warn_of_no_data(name, record.observed)
+        warn_of_missing_codes(name, record.observed, system.observables)
         _add_coord(model, row_dim, row_coords, name)
         _add_coord(model, component_dim, list(system.observables), name)
         if panel is not None:

@@ -60,6 +60,17 @@ def observes_state_space(model: pm.Model) -> bool:
     return any(node.outputs[1] in model.observed_RVs for node in nodes)
 
 
+def check_observed(model: pm.Model) -> None:
+    """Raise unless every StateSpace variable has data: without, its values are drawn as well."""
+    for name, node in state_space_nodes(model).items():
+        if node.outputs[1] in model.free_RVs:
+            raise ModelError(
+                f"{name!r} has no data, so that its values would be sampled like parameters: give "
+                f"it observed=..., use pm.observe(model, {{{name!r}: data}}), or draw it with "
+                "pm.sample_prior_predictive"
+            )
+
+
 def panel_variables(model: pm.Model) -> list[str]:
     """The names of the StateSpace variables that hold several records."""
     nodes = state_space_nodes(model)

@@ -55,7 +55,8 @@ def warn_of_no_data(name: str, observed: Any) -> None:
 def _unused_priors(model: pm.Model, nodes: dict[str, Any]) -> Iterator[str]:
     """Names of free variables that neither data nor a Deterministic depend on.
 
-    A variable that depends on one that reaches data is predicted, and not unused.
+    A variable that depends on one that reaches data is predicted, and not unused. A Deterministic
+    excuses no name that is reserved, which was meant to be a parameter.
     """
     data = [*model.observed_RVs, *model.potentials]
     if not (data and nodes):
@@ -64,7 +65,8 @@ def _unused_priors(model: pm.Model, nodes: dict[str, Any]) -> Iterator[str]:
     reached = free & set(ancestors([*data, *(node.outputs[1] for node in nodes.values())]))
     shown = free & set(ancestors(model.deterministics))
     for rv in model.free_RVs:
-        if rv not in reached | shown and not reached & set(ancestors([rv])):
+        excused = rv in shown and rv.name not in RESERVED
+        if not (rv in reached or excused) and not reached & set(ancestors([rv])):
             yield rv.name
 
 

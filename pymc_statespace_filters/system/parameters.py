@@ -10,6 +10,7 @@ from pytensor.raise_op import CheckAndRaise
 from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
+from .equations import RESERVED
 from .labels import rows_in_order
 from .model import StateSpaceModel
 from .panel import SymbolicPanel
@@ -27,8 +28,10 @@ def check_names(system: StateSpaceModel, params: Mapping[str, Any]) -> None:
         raise ModelError(f"params must be a mapping from names to values, got {params!r}")
     unknown = [name for name in params if name not in system.parameters]
     if unknown:
+        reserved = [f"; {name!r} is {what}" for name, what in RESERVED.items() if name in unknown]
         raise ModelError(
-            f"params must name parameters of the system, {list(system.parameters)}, got {unknown}"
+            f"params must name parameters of the system, {list(system.parameters)}, got "
+            f"{unknown}{''.join(reserved)}"
         )
 
 

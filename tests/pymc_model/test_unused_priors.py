@@ -43,9 +43,27 @@ def test_data_without_a_number_are_named():
             psf.StateSpace("d", PAIR, psf.EKF(), steps=STEPS, observed=np.nan * PAIR_DATA)
 
 
-def test_a_prior_with_a_reserved_name_is_named():
+@pytest.mark.parametrize(
+    "add", [lambda: pm.HalfNormal("t"), lambda: pm.Deterministic("rate", 1 / pm.HalfNormal("t"))]
+)
+def test_a_prior_with_a_reserved_name_is_named(add):
     with pytest.warns(ModelWarning, match=r"prior of 't' .*: 't' is the time .* never a parameter"):
-        warn_of_unused_priors(model_with(lambda: pm.HalfNormal("t")))
+        warn_of_unused_priors(model_with(add))
+
+
+def test_a_value_for_a_reserved_name_is_named():
+    with pytest.raises(ModelError, match=r"\['a', 'b'\], got \['t'\]; 't' is the time"):
+        psf.log_likelihood(PAIR, psf.EKF(), {"t": 1.0}, PAIR_DATA, steps=STEPS)
+
+
+def test_a_variable_without_data_is_not_sampled():
+    with pm.Model() as model:
+        pm.Normal("a", 0.5, 0.2)
+        psf.StateSpace("d", PAIR, psf.EKF(), steps=STEPS)
+    with pytest.raises(ModelError, match="'d' has no data, so that its values would be sampled"):
+        psf.sample(model=model)
+    with pytest.raises(ModelError, match="'d' has no data"):
+        pm.sample(step=psf.DRAM(model=model), model=model)
 
 
 def test_a_group_of_priors_that_reaches_nothing_is_named():

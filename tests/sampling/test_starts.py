@@ -154,7 +154,7 @@ def test_a_grid_evaluates_only_what_its_coarse_form_has_found(monkeypatch):
 @pytest.mark.parametrize("least", [0.0, 100.0])
 def test_starts_have_a_positive_likelihood_where_the_coarse_one_has_too_many(monkeypatch, least):
     def coarse_density(target):
-        return LogDensity(*target._shared, graph=target._model.logp(vars=target._model.free_RVs))
+        return LogDensity(*target._shared, graph=target.model.logp(vars=target.model.free_RVs))
 
     monkeypatch.setattr(Target, "coarse_density", coarse_density)
     with pm.Model() as model:
@@ -165,6 +165,37 @@ def test_starts_have_a_positive_likelihood_where_the_coarse_one_has_too_many(mon
             starts_of(model)
     else:
         assert all(start["x"] > least for start in starts_of(model, 64))
+
+
+def _decay(unit=1.0, **noise):
+    """The model of a decaying state, whose sensor has its error in other units."""
+    system = psf.StateSpaceModel(
+        psf.EulerMaruyama(lambda x, k: [-k * x[0]], [[0.0]], dt=0.1),
+        observation=lambda x: [x[0]],
+        observation_noise=lambda r: [[(r / unit) ** 2]],
+        initial_mean=[1.0],
+        initial_cov=[[0.0]],
+    )
+    steps = np.arange(1, 31)
+    observed = psf.simulate(
+        system, {"k": 1.0, "r": 0.1 * unit}, steps=steps, random_seed=1, **noise
+    )["observations"]
+    with pm.Model() as model:
+        pm.HalfNormal("k", 2.0)
+        pm.HalfNormal("r", 1.0)
+        psf.StateSpace("d", system, psf.EKF(), steps=steps, observed=observed)
+    return model
+
+
+def test_a_record_that_is_fitted_exactly_has_no_posterior():
+    with pytest.raises(
+        ModelError, match=r"no bound towards the lower end of r, because .* exactly"
+    ):
+        starts_of(_decay(noise=False))
+
+
+def test_a_parameter_in_small_units_is_no_exact_fit():
+    assert all(0.5e-10 < start["r"] < 2e-10 for start in starts_of(_decay(unit=1e-9)))
 
 
 def test_models_without_a_proper_prior_or_a_positive_likelihood_are_refused():

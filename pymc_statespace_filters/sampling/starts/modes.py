@@ -165,8 +165,7 @@ def _differing(model: Model, raveled: RaveledVariables, modes: list[Array]) -> l
     apart = np.ptp(means, axis=0) / np.where(within > 0, within, np.inf)
     order = np.argsort(-apart)
     chosen = [i for i in order if apart[i] > _APART] or [order[0]]
-    variables = {v.name: model.values_to_rvs[v].name for v in raveled.variables}
-    return list(dict.fromkeys(variables[raveled.name_at(int(i))] for i in chosen))[:_MOST_NAMED]
+    return list(dict.fromkeys(raveled.rv_at(model, int(i)).name for i in chosen))[:_MOST_NAMED]
 
 
 def _short(value: Array) -> str:

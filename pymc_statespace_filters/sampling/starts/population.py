@@ -37,6 +37,7 @@ from ..target.settings import RandomWalkSettings
 from ..target.target import MANY_DIMENSIONS, Target
 from ..target.variables import RaveledVariables
 from .annealing import N_SWEEPS, Population, anneal
+from .exact_fit import check_fit
 from .langevin import settle
 from .modes import Points, find_modes
 
@@ -96,14 +97,16 @@ def find_population(
     Raises
     ------
     ModelError
-        If no draw of the prior has a positive likelihood.
+        If no draw of the prior has a positive likelihood, or if the model fits the record exactly.
     """
     search = partial(_search, target, rng, progressbar=progressbar, n_points=n_points, pilot=pilot)
+    found = None
     if (coarse := target.coarse_density()) is not None:
         found = _evaluated(target, search(coarse), rng, progressbar=progressbar)
-        if len(found.x):
-            return found
-    return search(target.density)
+    if found is None or not len(found.x):
+        found = search(target.density)
+    check_fit(target, found.x, found.log_density)
+    return found
 
 
 def _evaluated(

@@ -229,7 +229,7 @@ class RecordTarget(SampledModel):
 
     def variable_name(self, value: TensorVariable) -> str:
         """The name of the free variable of a value."""
-        return self._model.values_to_rvs[value].name
+        return self.model.values_to_rvs[value].name
 
     def prepare(self) -> None:
         """Load the machine code, and read data and fixed seeds as they are now."""

@@ -9,7 +9,13 @@ from pymc.model import Model
 from pytensor.tensor.variable import TensorVariable
 
 from ...errors import ModelError
-from ...pymc_model.inspection import collapse_remedies, exactness, noise_seeds, noisy_filters
+from ...pymc_model.inspection import (
+    check_observed,
+    collapse_remedies,
+    exactness,
+    noise_seeds,
+    noisy_filters,
+)
 from ...pymc_model.unused_priors import warn_of_unused_priors
 from .initial_points import PriorDraws
 from .settings import RandomWalkSettings
@@ -52,8 +58,9 @@ class SampledModel:
     def __init__(
         self, model: Model, vars: Sequence[TensorVariable] | None, settings: RandomWalkSettings
     ):
+        check_observed(model)
         warn_of_unused_priors(model)
-        self.settings = settings
+        self.model, self.settings = model, settings
         variables = continuous_value_vars(vars, model)
         self._seeds = noise_seeds(model)
         check_noise_dependencies(model, variables, self._seeds)
@@ -65,17 +72,16 @@ class SampledModel:
         if not self.raveled.dim:
             raise ModelError("model must have at least one free variable to sample, got none")
         self.prior_draws = PriorDraws(model, self.raveled, self._default)
-        self._model = model
 
     @cached_property
     def collapse_remedy(self) -> str:
         """What to do where particles collapse, for every filter of the model that has some."""
-        return collapse_remedies(self._model)
+        return collapse_remedies(self.model)
 
     @cached_property
     def noisy_filters(self) -> list[Any]:
         """The filters whose likelihood is an estimate."""
-        return list(noisy_filters(self._model).values())
+        return list(noisy_filters(self.model).values())
 
     def _read_seeds(self) -> None:
         seeds = [seed.get_value() for seed in self._seeds.values()]

@@ -93,16 +93,16 @@ class Target(SampledModel):
     @cached_property
     def is_expensive(self) -> bool:
         """Whether an evaluation takes milliseconds, not microseconds."""
-        return bool(expensive_variables(self._model))
+        return bool(expensive_variables(self.model))
 
     def coarse_density(self) -> LogDensity | None:
         """The log-density with coarse filters, if there are any; noise as in ``density``."""
-        filters = coarse_filters(self._model)
+        filters = coarse_filters(self.model)
         return self.density_with(filters) if filters else None
 
     def density_with(self, filters: Mapping[str, Filter]) -> LogDensity:
         """The log-density with other filters, given by the names of their variables."""
-        graph = tempered_density(self._model, filters, 1.0)
+        graph = tempered_density(self.model, filters, 1.0)
         fixed_noise = not self.settings.refresh_noise
         return LogDensity(*self._shared, fixed_noise=fixed_noise, graph=graph)
 
@@ -111,7 +111,7 @@ class Target(SampledModel):
         filters = self._pilot_filters()
         if not filters:
             return None
-        graph = tempered_density(self._model, filters, PILOT_POWER)
+        graph = tempered_density(self.model, filters, PILOT_POWER)
         return LogDensity(*self._shared, fixed_noise=True, graph=graph)
 
     def _pilot_filters(self) -> dict[str, Filter]:
@@ -120,7 +120,7 @@ class Target(SampledModel):
         In few dimensions particles find the posterior of counts as well without an `IPLF`, whose
         compilation takes seconds.
         """
-        return pilot_filters(self._model, takes_counts=self.raveled.dim >= MANY_DIMENSIONS)
+        return pilot_filters(self.model, takes_counts=self.raveled.dim >= MANY_DIMENSIONS)
 
     def gradient_rows(self, *, of_pilot: bool) -> Rows | None:
         """The log-density, or that of the pilot, with its gradient as the last result.
@@ -129,7 +129,7 @@ class Target(SampledModel):
         """
         graph = None
         if of_pilot:
-            graph = tempered_density(self._model, self._pilot_filters(), PILOT_POWER)
+            graph = tempered_density(self.model, self._pilot_filters(), PILOT_POWER)
         elif self.is_expensive:
             return None
         try:

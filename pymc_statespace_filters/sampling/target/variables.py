@@ -35,6 +35,11 @@ class RaveledVariables:
         ends = np.cumsum([size for _, _, size, _ in self._layout])
         return self._layout[int(np.searchsorted(ends, i, side="right"))][0]
 
+    def rv_at(self, model: Model, i: int) -> TensorVariable:
+        """The free variable of a model that element i of the vector belongs to."""
+        name = self.name_at(i)
+        return next(model.values_to_rvs[v] for v in self.variables if v.name == name)
+
     def ravel(self, point: Mapping[str, np.ndarray]) -> np.ndarray:
         """Ravel the values of a point into the vector, shape (d,)."""
         return self._map(point).data.astype(np.float64, copy=False)
