@@ -26,7 +26,7 @@ from .ensemble.kalman_update import (
 )
 from .ensemble.loop import Outcome, ensemble_filter, failed
 from .ensemble.noise import NoiseSizes, observation_normals
-from .outcomes import COVARIANCE_NOT_POSITIVE, NONE
+from .outcomes import NONE, SINGULAR
 from .plan import log_density, observe
 from .protocol import System
 
@@ -74,7 +74,7 @@ def update(system, j, k, t, d, noise, members, local, work):
         mark_finite(X, X, alive)
         return failed(failure_of_all(system, k, t, d, members, local))
     if not forecast_covariances(members, d, n_alive - 1.0, local, moments):
-        return failed(COVARIANCE_NOT_POSITIVE, n_alive)
+        return failed(SINGULAR, n_alive)
 
     # Increment of the log-likelihood, and how many members carry it (Eq. 4.43)
     increment, n_effective = forecast.log_sum, forecast.n_effective  # Eq. 4.26

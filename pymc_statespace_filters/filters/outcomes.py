@@ -36,8 +36,7 @@ class Failure(OutcomeCode):
     )
     COVARIANCE_NOT_POSITIVE = (
         2,
-        "by rounding errors, the covariance of the predicted state or observation is not positive "
-        "definite",
+        "by rounding errors, the covariance of the predicted state is not positive definite",
         "Use units in which states and observables have similar sizes, or a larger "
         "observation_noise",
     )
@@ -78,6 +77,13 @@ class Failure(OutcomeCode):
         "Write probabilities so that they always are such, for example with pm.math.sigmoid, or "
         "give them Beta and Dirichlet priors",
     )
+    SINGULAR = (
+        13,
+        "the covariance of the predicted observation is singular (stochastic singularity)",
+        "Give the sensors noise, or let as many independent noises reach the observables as there "
+        "are sensors without noise; if they do, use units in which states and observables have "
+        "similar sizes",
+    )
 
     @property
     def has_row(self) -> bool:
@@ -97,7 +103,7 @@ _WITHOUT_ROW = (
 (
     RAISED, NOT_A_NUMBER, NONE, STATE_NOT_FINITE, COVARIANCE_NOT_POSITIVE, ZERO_DENSITY,
     NO_PROCESS_NOISE, GRID_TOO_LARGE, OUT_OF_MEMORY, TOO_FAR, INITIAL_COV, PROCESS_NOISE,
-    OBSERVATION_NOISE, OBSERVATION_UNDEFINED, INVALID_PROBABILITY,
+    OBSERVATION_NOISE, OBSERVATION_UNDEFINED, INVALID_PROBABILITY, SINGULAR,
 ) = map(int, Failure)  # fmt: skip
 
 

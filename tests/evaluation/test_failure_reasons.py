@@ -120,9 +120,20 @@ def test_rounding_errors_are_told_from_a_sensor_that_is_not_defined():
         initial_cov=[[1e12]],
     )  # fmt: skip
     observed = np.array([[1.0, 2.0]] * 3)
-    check(
-        twice, {"a": 1.0}, Failure.COVARIANCE_NOT_POSITIVE, filters=[psf.EKF()], observed=observed
-    )
+    check(twice, {"a": 1.0}, Failure.SINGULAR, filters=[psf.EKF()], observed=observed)
+
+
+def test_more_exact_sensors_than_shocks_are_a_stochastic_singularity():
+    """By rounding, this singular covariance is positive definite: 16 nats in the first row."""
+    loadings, none = np.array([[1.0], [0.3]]), np.zeros((2, 2))
+    exact = system(
+        transition=lambda x, q, a: a * x + loadings @ q, process_noise=[[1.0]],
+        observation=lambda x: x, observation_noise=none, initial_mean=[1.0, 1.0], initial_cov=none,
+    )  # fmt: skip
+    observed = np.array([[2.0, 1.3]] * 3)
+    filters = [psf.EKF(), psf.UKF()]
+    check(exact, {"a": 1.0}, Failure.SINGULAR, filters=filters, observed=observed)
+    assert "stochastic singularity" in Failure.SINGULAR.message
 
 
 @pytest.mark.parametrize("filter", [psf.EKF(), psf.BootstrapPF(60)], ids=str)

@@ -24,6 +24,9 @@ from ..native.jit import copy_into
 from ..numerics.small_cholesky import LOG_TWO_PI
 from .symbols import SYMBOLS, call, observation_moments, symbols_of
 
+# A pivot of a covariance that is smaller, relative to its variance, has no correct digit.
+_ROUNDING = 4.0 * np.finfo(float).eps
+
 
 def without_missing(
     datum: TensorVariable, mean: TensorVariable, cov: TensorVariable
@@ -47,7 +50,10 @@ def log_normal(
     """log N(residual; 0, cov) over the components with ``seen`` = 1; NaN if cov is not definite."""
     chol = cholesky(cov, lower=True)
     standardised = solve_triangular(chol, residual, lower=True, b_ndim=1)
-    log_det = pt.sum(pt.log(pt.diagonal(chol)))
+    root = pt.diagonal(chol)
+    if residual.type.shape != (1,):
+        root = pt.where(root**2 > _ROUNDING * pt.diagonal(cov), root, np.nan)
+    log_det = pt.sum(pt.log(root))
     return -0.5 * pt.sum(standardised**2) - log_det - 0.5 * LOG_TWO_PI * pt.sum(seen)
 
 

@@ -12,6 +12,7 @@ from ..outcomes import (
     COVARIANCE_NOT_POSITIVE,
     LARGEST,
     OBSERVATION_UNDEFINED,
+    SINGULAR,
     STATE_NOT_FINITE,
     ZERO_DENSITY,
 )
@@ -83,4 +84,4 @@ def _failure(machine, s, term, taken):
         return OBSERVATION_UNDEFINED if np.isnan(term) else ZERO_DENSITY
     if not taken[:-1].all():
         return OBSERVATION_UNDEFINED
-    return ZERO_DENSITY if taken[-1] else COVARIANCE_NOT_POSITIVE
+    return ZERO_DENSITY if taken[-1] else SINGULAR
