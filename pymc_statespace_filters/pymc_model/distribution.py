@@ -20,8 +20,13 @@ from ..system.clock import Clock
 from ..system.given_record import GivenRecord
 from ..system.model import StateSpaceModel
 from ..system.panel import SymbolicPanel, symbolic_panel
-from ..system.parameters import check_names, symbolic_panel_parameters, symbolic_parameters
-from ..system.record import check_seed, symbolic_record
+from ..system.parameters import (
+    check_names,
+    known_elements,
+    symbolic_panel_parameters,
+    symbolic_parameters,
+)
+from ..system.record import check_seed, check_system, symbolic_record
 from ..system.timed_inputs import TimedInputs
 from . import dispatch as dispatch  # registers draw and density
 from .missing_codes import warn_of_missing_codes
@@ -159,11 +164,13 @@ class StateSpace(Continuous):
             )
         if not isinstance(name, str) or not name:
             raise ModelError(f"name must be a text that is not empty, got {name!r}")
-        check_system_and_filter(system, filter)
-        warn_of_choice(system, filter)
+        check_system(system)
         own = {} if params is None else params
         check_names(system, own)
         values = dict(system.defaults) | _model_variables(system, model) | dict(own)
+        system = system.with_known(known_elements(system, values))
+        check_system_and_filter(system, filter)
+        warn_of_choice(system, filter)
         others = tuple(model.named_vars)
         full_name = model.name_for(name)
         _check_name(model, full_name, name, system)

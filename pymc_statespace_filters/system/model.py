@@ -6,6 +6,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import pytensor.tensor as pt
+from pytensor.graph.fg import FrozenFunctionGraph
 
 from ..errors import ModelError
 from .drift import DriftingParameter, held_for
@@ -15,6 +17,9 @@ from .labels import default_names
 from .readers import observables_that_read
 from .signature import checked_names, names_of_states, read_signature, size_of
 from .tracing import INPUT_ROW, Equations, read, size, trace
+
+# What a system keeps beside its fields, to trace it again.
+_AS_WRITTEN = ("_written", "_settings")
 
 
 @dataclass(init=False, repr=False)
@@ -204,6 +209,7 @@ class StateSpaceModel:
             observation_has_u=any("u" in e.symbols for e in functions.observation.equations),
             keeps_noises=False,
             equations=equations,
+            known=(),
         )
         names = {"states": states, "observables": observables, "inputs": inputs}
         others = {
@@ -240,6 +246,8 @@ class StateSpaceModel:
     observation_has_u: bool
     keeps_noises: bool
     equations: Equations
+    # Elements of the flat parameters that a model fixes, and their numbers.
+    known: tuple[tuple[int, float], ...] = ()
 
     def _set(self, **attributes: Any) -> None:
         self.__dict__.update(attributes)
@@ -307,6 +315,34 @@ class StateSpaceModel:
         if system.has_gaussian_start:
             return system
         return system._with_equations({"initial_draw": None, "finite_start": None})
+
+    def with_known(self, known: tuple[tuple[int, float], ...]) -> "StateSpaceModel":
+        """The same system where these elements of the flat parameters have these numbers.
+
+        Its equations are as they were, so that nothing is compiled anew; see `folded`.
+        """
+        if known == self.known:
+            return self
+        system = object.__new__(StateSpaceModel)
+        own = {name: value for name, value in self.__dict__.items() if name in _AS_WRITTEN}
+        system._set(**self.__getstate__() | own | {"known": known})
+        return system
+
+    @cached_property
+    def folded(self) -> "StateSpaceModel":
+        """The system with the known numbers in its equations: what they are then can be asked."""
+        if not self.known:
+            return self
+        theta, known = self.equations.transition.inputs[0].type("theta"), dict(self.known)
+        numbers = pt.stack([pt.constant(known[i]) if i in known else theta[i]
+                            for i in range(self.n_theta)])  # fmt: skip
+        folded = {}
+        for name, graph in vars(self.equations).items():
+            if isinstance(graph, FrozenFunctionGraph):
+                others = [v.type() for v in graph.inputs[1:]]
+                outputs = graph.bind([numbers, *others])
+                folded[name] = FrozenFunctionGraph.from_io([theta, *others], outputs)
+        return self._with_equations(folded)._with(known=())
 
     def _with_equations(self, equations: Mapping[str, Any]) -> "StateSpaceModel":
         return self._with(equations=replace(self.equations, **equations))
@@ -388,6 +424,7 @@ class StateSpaceModel:
         if drifting is not None:
             settings = settings | {"drifting": drifting}
         system._trace(own["_written"] | changes, **settings, at_any_times=at_any_times)
+        system._set(known=self.known)
         return system
 
     @property
@@ -424,7 +461,7 @@ class StateSpaceModel:
     @cached_property
     def fingerprint(self) -> str:
         """A digest of the equations and settings, the same in every process."""
-        return digest(describe(self))
+        return digest(describe(self.with_known(())))
 
 
 def _checked_resets(resets: Any) -> str:

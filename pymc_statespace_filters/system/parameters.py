@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
-from pytensor.graph.basic import Variable
+from pytensor.graph.basic import Constant, Variable
 from pytensor.raise_op import CheckAndRaise
 from pytensor.tensor.variable import TensorVariable
 
@@ -58,6 +58,21 @@ def flat_parameters(system: StateSpaceModel, params: Mapping[str, Any]) -> np.nd
     if not parts:
         return np.zeros((0,))
     return np.concatenate([np.broadcast_to(p, (*batch, p.shape[-1])) for p in parts], axis=-1)
+
+
+def known_elements(
+    system: StateSpaceModel, values: Mapping[str, Any]
+) -> tuple[tuple[int, float], ...]:
+    """The elements of the flat parameters that are numbers, the same in all records, and these."""
+    known: list[tuple[int, float]] = []
+    first = 0
+    for name, shape in zip(system.parameters, system.parameter_shapes, strict=True):
+        value: Any = values.get(name, ...)
+        value = value.data if isinstance(value, Constant) else value
+        if value is not ... and not isinstance(value, Variable) and np.shape(value) == shape:
+            known += enumerate(numbers(name, value).ravel().tolist(), first)
+        first += int(np.prod(shape, dtype=int))
+    return tuple(known)
 
 
 def element_names(system: StateSpaceModel) -> list[str]:

@@ -73,10 +73,13 @@ class CompiledSystem:
         The states that an update may move: all but the carried ones.
     """
 
-    def __init__(self, written: StateSpaceModel) -> None:
-        found = lowered(written)
-        self.written, self.model = written, found.model
-        model = self.model
+    def __init__(self, given: StateSpaceModel) -> None:
+        # Numbers that a model fixes may decide which values a finite state has.
+        is_finite = (given.equations.finite_step or given.equations.finite_start) is not None
+        self._posed = given
+        self.written = given.folded if is_finite else given.with_known(())
+        found = lowered(self.written)
+        self.model = model = found.model
         self._extension = found.extension
         self.n, self.p, self.r = model.n, model.p, model.r
         self.n_inputs, self.n_theta, self.dt = model.n_input_columns, model.n_theta, model.dt
@@ -248,75 +251,80 @@ class CompiledSystem:
     # Properties
 
     @cached_property
+    def asked(self) -> StateSpaceModel:
+        """The ``model`` with the numbers that are known, of which all properties are asked."""
+        return lowered(self._posed.folded).model
+
+    @cached_property
     def is_deterministic(self) -> bool:
         """Whether the state is a function of the parameters: no noise, and a known start."""
-        return structure.is_deterministic(self.model)
+        return structure.is_deterministic(self.asked)
 
     @cached_property
     def undriven_states(self) -> tuple[str, ...]:
         """The names of the states with an uncertain start that noise is known never to reach."""
-        return tuple(self.states[i] for i in structure.undriven_states(self.model))
+        return tuple(self.states[i] for i in structure.undriven_states(self.asked))
 
     @cached_property
     def with_gaussian_steps(self) -> "CompiledSystem":
         """The system with normal variables in place of others in ``process_dist``."""
-        return compile_system(self.written.with_gaussian_steps)
+        return compile_system(self._posed.with_gaussian_steps)
 
     @cached_property
     def gaussian(self) -> "CompiledSystem":
         """The same with a Gaussian start."""
-        return compile_system(self.written.gaussian)
+        return compile_system(self._posed.gaussian)
 
     @cached_property
     def is_linear(self) -> bool:
         """Whether state and noise enter transition and observation linearly; False if unknown."""
-        return structure.is_linear(self.model)
+        return structure.is_linear(self.asked)
 
     @cached_property
     def has_additive_process_noise(self) -> bool:
         """Whether g(x, q) = g(x, 0) + G(x) q; False if unknown."""
-        return structure.has_additive_process_noise(self.model)
+        return structure.has_additive_process_noise(self.asked)
 
     @cached_property
     def has_smooth_transition(self) -> bool:
         """Whether no part of the transition has a kink or a jump; False if unknown."""
-        return structure.has_smooth_transition(self.model)
+        return structure.has_smooth_transition(self.asked)
 
     @cached_property
     def is_smooth(self) -> bool:
         """Whether no equation has a kink or jump in states or parameters; False if unknown."""
-        return structure.is_smooth(self.model)
+        return structure.is_smooth(self.asked)
 
     @cached_property
     def jumping_equations(self) -> tuple[str, ...]:
         """Those of "transition" and "observation" that are known to jump in the state."""
-        return jumping_equations(self.model)
+        return jumping_equations(self.asked)
 
     @cached_property
     def jumping_parameters(self) -> tuple[str, ...]:
         """Drifting parameters at whose threshold an equation is known to jump."""
-        return jumping_parameters(self.model)
+        return jumping_parameters(self.asked)
 
     @cached_property
     def stepped_parameters(self) -> tuple[str, ...]:
         """Parameters of which every likelihood is known to be a staircase."""
-        return stepped_parameters(self.model)
+        return stepped_parameters(self.asked)
 
     @cached_property
     def has_smooth_sensor(self) -> bool:
         """Whether no observable has a kink as a function of the state."""
-        return structure.has_smooth_sensor(self.model)
+        return structure.has_smooth_sensor(self.asked)
 
     @cached_property
     def has_exact_sensor(self) -> bool:
         """Whether a sensor has no noise; False if unknown."""
-        return structure.has_exact_sensor(self.model)
+        return structure.has_exact_sensor(self.asked)
 
     @cached_property
     def is_time_invariant(self) -> bool:
         """Whether `step_moments` depends on neither inputs nor time; False if unknown."""
-        symbols = {name: symbols_of(self.model)[name] for name in ("theta", *"xut")}
-        moments = structure.step_moments(self.model, symbols)
+        symbols = {name: symbols_of(self.asked)[name] for name in ("theta", *"xut")}
+        moments = structure.step_moments(self.asked, symbols)
         return structure.is_free_of(("u", "t"), moments, symbols)
 
     @cached_property
@@ -325,7 +333,7 @@ class CompiledSystem:
         if self.model.held_for:  # a parameter that is held has no noise
             return False
         additive = self.has_additive_process_noise
-        return additive and structure.process_noise_reaches_every_state(self.model)
+        return additive and structure.process_noise_reaches_every_state(self.asked)
 
     @property
     def has_exact_observation_density(self) -> bool:
