@@ -1,6 +1,6 @@
 """Whether a model's integration steps are stable, and its log-density with steps half as long."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from .inspection import likelihood_nodes
 
 MAX_STEPS = 500
 STEPS_PER_JACOBIAN = 10
+_ANY_FACTOR = np.array([[-1e9 + 0j]])
 
 Array = NDArray[np.float64]
 
@@ -142,6 +143,39 @@ def step_stability(model: pm.Model) -> Callable[[Array], NDArray[np.bool_]] | No
     The returned function takes points of the joined value variables, shape (m, k), and returns
     booleans of shape (m,). None if no variable has an integrator.
     """
+
+    def is_stable(system: StateSpaceModel, *arguments: Array) -> NDArray[np.bool_]:
+        assert system.integrator is not None
+        return system.integrator.is_stable_at(path_eigenvalues(system, *arguments)).all(axis=1)
+
+    along = _along_paths(model, is_stable)
+    return None if along is None else lambda x: along(x).all(axis=1)
+
+
+def step_accuracy(model: pm.Model) -> Callable[[Array], Array] | None:
+    """How far steps half as long multiply small deviations by other factors; as `step_stability`.
+
+    The largest difference of a factor of one step and of two half as long, along the path; of
+    Euler-Maruyama steps the square of half the rate times the step.
+    """
+
+    def difference(system: StateSpaceModel, *arguments: Array) -> Array:
+        assert system.integrator is not None
+        if system.integrator.is_stable_at(_ANY_FACTOR).all():  # exact for linear equations
+            return np.zeros(len(arguments[0]))
+        half = system.with_integrator(system.integrator.refined())
+        factors, of_halves = _path_eigenvalues([system, half], *arguments)
+        differences = np.abs(np.sort(factors, axis=-1) - np.sort(of_halves**2, axis=-1))
+        return np.nan_to_num(differences, nan=0.0).max(axis=(1, 2))
+
+    along = _along_paths(model, difference)
+    return None if along is None else lambda x: along(x).max(axis=1)
+
+
+def _along_paths(
+    model: pm.Model, examine: Callable[..., NDArray[Any]]
+) -> Callable[[Array], NDArray[Any]] | None:
+    """What ``examine(system, theta, steps, inputs, t0)`` gives for every record, (m, records)."""
     nodes = [n for n in likelihood_nodes([model.logp()]) if n.op.system.integrator is not None]
     if not nodes:
         return None
@@ -150,19 +184,17 @@ def step_stability(model: pm.Model) -> Callable[[Array], NDArray[np.bool_]] | No
     needed = [node.inputs[i] for node in nodes for i in (0, 1, 3, 4)]
     record, _ = compile_raveled(model.initial_point(), needed, values, mode="FAST_COMPILE")
 
-    def is_stable(x: Array) -> NDArray[np.bool_]:
+    def along(x: Array) -> NDArray[Any]:
         columns = [np.stack(column) for column in zip(*map(record, x), strict=True)]
-        stable = np.ones(len(x), dtype=bool)
+        found = []
         for i, node in enumerate(nodes):
-            system, arguments = node.op.system, columns[4 * i : 4 * i + 4]
+            arguments = columns[4 * i : 4 * i + 4]
             if node.op.form == PANEL:
                 arguments = _each_record(*arguments)
-            eigenvalues = path_eigenvalues(system, *arguments)
-            is_stable_at = system.integrator.is_stable_at(eigenvalues).all(axis=1)
-            stable &= is_stable_at.reshape(len(x), -1).all(axis=1)
-        return stable
+            found.append(examine(node.op.system, *arguments).reshape(len(x), -1))
+        return np.concatenate(found, axis=1)
 
-    return is_stable
+    return along
 
 
 def _each_record(theta: Array, rows: Array, inputs: Array, t0: Array) -> list[Array]:
@@ -198,10 +230,18 @@ def path_eigenvalues(
     are those of the likelihood at m points. The path starts from the initial mean. Eigenvalues are
     NaN where the Jacobian is not finite.
     """
+    return _path_eigenvalues([system], theta, steps, inputs, t0)[0]
+
+
+def _path_eigenvalues(
+    systems: Sequence[StateSpaceModel], theta: Array, steps: Array, inputs: Array, t0: Array
+) -> list[NDArray[np.complex128]]:
+    """Those of substeps of each system, along the path of the first."""
+    system = systems[0]
     assert system.integrator is not None
     single = system.with_integrator(system.integrator.substep())
     length, substeps = single.dt, round(system.dt / single.dt)
-    start, advance, jacobian = _compile_path(single, _examined(system))
+    start, advance, *jacobians = _compile_path(single, list(map(_examined, systems)))
     if inputs.shape[1] == 0:  # a system without inputs
         inputs = np.zeros((len(theta), 1, system.n_input_columns))
     n_steps = min(int(steps.max(initial=0)) * substeps, MAX_STEPS)
@@ -210,14 +250,15 @@ def path_eigenvalues(
     rows = with_resets(system, inputs[:, :n_rows], 0.0)
     inputs = divided(system, rows, substeps)
     x = start(theta)
-    eigenvalues = []
+    eigenvalues: list[list[NDArray[np.complex128]]] = [[] for _ in systems]
     with np.errstate(all="ignore"):
         for k in range(n_steps + 1):
             now = theta, x, inputs[:, min(k, inputs.shape[1] - 1)], t0 + k * length
             if k % STEPS_PER_JACOBIAN == 0 or k == n_steps:
-                eigenvalues.append(_eigenvalues(jacobian(*now)))
+                for found, jacobian in zip(eigenvalues, jacobians, strict=True):
+                    found.append(_eigenvalues(jacobian(*now)))
             x = advance(*now)
-    return np.stack(eigenvalues, axis=1)
+    return [np.stack(found, axis=1) for found in eigenvalues]
 
 
 def _eigenvalues(jacobians: Array) -> NDArray[np.complex128]:
@@ -235,16 +276,18 @@ def _examined(system: StateSpaceModel) -> StateSpaceModel:
     return system.with_integrator(examined())
 
 
-def _compile_path(system: StateSpaceModel, examined: StateSpaceModel) -> list[Callable]:
-    """Initial mean, next state, and Jacobian of the examined step, each for many points at once."""
+def _compile_path(system: StateSpaceModel, examined: Sequence[StateSpaceModel]) -> list[Callable]:
+    """Initial mean, next state, and Jacobians of the examined steps, each for many points."""
     symbols = symbols_of(system)
     theta, now = symbols["theta"], [symbols[name] for name in ("theta", "x", "u", "t")]
     values = dict(zip(("theta", "x", "u", "t"), now, strict=True))
-    advanced = call(system.equations.transition, system, values)
     start = call(system.equations.initial_mean, system, {"theta": theta})
-    seen = call(examined.equations.transition, examined, values)
-    graphs = [([theta], start), (now, advanced), (now, jacobian_of(seen, values["x"]))]
-    return [interpreted_at_points(arguments, output) for arguments, output in graphs]
+    steps = [call(s.equations.transition, s, values) for s in (system, *examined)]
+    graphs = [steps[0], *(jacobian_of(step, values["x"]) for step in steps[1:])]
+    return [
+        interpreted_at_points([theta], start),
+        *(interpreted_at_points(now, graph) for graph in graphs),
+    ]
 
 
 def _deterministic_filter(

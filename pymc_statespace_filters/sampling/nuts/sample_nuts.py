@@ -16,6 +16,7 @@ from ...pymc_model.elements import element_names
 from ...pymc_model.inspection import exactness, filters_used
 from ..output.datatree import to_datatree
 from ..output.filter_check import FilterCheck, check_filters, warn_of_filters
+from ..output.step_check import step_warnings
 from ..output.unvisited import unvisited_warnings
 from ..run.request import ExecutionOptions, SamplingRequest
 from ..starts.modes import modes_message, modes_warning
@@ -54,7 +55,7 @@ def sample_nuts(model: Model, request: SamplingRequest, options: ExecutionOption
     tree = _tree(model, target, chains, request)
     missed, check = [], FilterCheck()
     with suppress(KeyboardInterrupt):
-        missed = unvisited_warnings(tree, model, chains.seconds, rng)
+        missed = unvisited_warnings(tree, model, chains.seconds, rng) + step_warnings(tree, model)
         iterations = request.tune + chains.length.n_iterations
         check = check_filters(tree, model, iterations, chains.seconds, rng)
     level = "info" if progressbar else "debug"

@@ -28,6 +28,7 @@ from ..output.report import (
     until_ess_warning,
 )
 from ..output.sample_stats import stat_dims, whole_chain
+from ..output.step_check import step_warnings
 from ..output.unvisited import unvisited_warnings
 from ..output.warnings import LOWER, STANDSTILL, PhaseStatistics, below_known, chain_warnings
 from ..target.record_target import RecordTarget
@@ -114,6 +115,7 @@ class ModelResult:
             with suppress(KeyboardInterrupt):
                 rng = side_generator(key, 3)
                 noise_warnings += unvisited_warnings(tree, self.model, self.seconds, rng)
+                noise_warnings += step_warnings(tree, self.model)
         check = self._check_filters(tree, key) if check_convergence else FilterCheck()
         noise_warnings += unreached
         if not unreached and warnings.keys().isdisjoint({STANDSTILL, LOWER}):  # which explain it

@@ -1,0 +1,44 @@
+"""Steps too long for the equations are named at the end of a run, and others are not."""
+
+import logging
+
+import numpy as np
+import pymc as pm
+import pytest
+
+import pymc_statespace_filters as psf
+
+
+def decay(dt, integrator=psf.EulerMaruyama, **options):
+    return psf.StateSpaceModel(
+        integrator(lambda x, k: [-k * x[0]], lambda s: [[s]], dt=dt, **options),
+        observation=lambda x: [x[0]],
+        observation_noise=[[0.05**2]],
+        initial_mean=[1.0],
+        initial_cov=[[0.1]],
+    )
+
+
+@pytest.fixture(scope="module")
+def record():
+    """A rate of 3 seen twice in a unit of time."""
+    steps = np.arange(1, 101) * 100
+    return psf.simulate(decay(0.005), {"k": 3.0, "s": 1.0}, steps=steps, random_seed=1)
+
+
+@pytest.mark.parametrize(
+    ("system", "is_named"),
+    [
+        (decay(0.5), True),
+        (decay(0.5, substeps=16), False),
+        (decay(0.5, psf.LocalLinearization), False),
+    ],
+    ids=["long", "substeps", "exact"],
+)
+def test_steps_too_long_are_named(record, system, is_named, caplog):
+    with pm.Model(), caplog.at_level(logging.WARNING, "pymc"):
+        pm.HalfNormal("k", 4.0)
+        pm.HalfNormal("s", 4.0)
+        psf.StateSpace("d", system, psf.EKF(), steps=range(1, 101), observed=record["observations"])
+        psf.sample(500, sampler="dram", random_seed=1, progressbar=False)
+    assert ("steps half as long the posterior would move" in caplog.text) == is_named
