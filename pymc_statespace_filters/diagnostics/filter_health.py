@@ -37,6 +37,8 @@ PREDICTION_NOTE = (
     "each observation is predicted from those before it, at parameters drawn from their posterior "
     "given all observations: the predictions are slightly better than real ones"
 )
+# At the draws that are taken of a long record: some 0.6 GB, and four seconds of an EKF.
+_MOST_NUMBERS, _LEAST_DRAWS = 2e7, 40
 
 
 def filter_diagnostics(
@@ -64,15 +66,19 @@ def filter_diagnostics(
 
     Parameters
     ----------
-    idata, model, var_name, filter, n_draws, extend_inferencedata, progressbar
+    idata, model, var_name, filter, extend_inferencedata, progressbar
         As in `filtered_states`.
+    n_draws : int, optional
+        Number of draws to use, evenly from every chain. By default all of them, or of long records
+        as many as need less than one gigabyte, and 40 at least: 160 of 20 000 rows of one state.
     random_seed : None, int or numpy.random.Generator
         Seed of states, simulated observations and random tie-breaking.
 
     Returns
     -------
     xarray.DataTree
-        With the group ``filter_diagnostics``. For a variable "d":
+        With the group ``filter_diagnostics``, whose attribute ``draws`` is the number of draws used
+        and of all. For a variable "d":
 
         * ``d_predicted`` (chain, draw, d_time, observable): a simulated observation of a state
           drawn given the earlier observations; NaN after a failure of the filter.
@@ -153,9 +159,13 @@ def filter_diagnostics(
     """
     model = model_of_draws(model, idata)
     rng = check_random_seed(random_seed)
+    variables = select_variables(model, var_name, filter)
+    every = select_draws(idata, None)
+    if n_draws is None:
+        n_draws = min(_most_draws(variables), int(np.prod(every.shape)))
     draws = select_draws(idata, n_draws)
     parts = []
-    for variable in select_variables(model, var_name, filter):
+    for variable in variables:
         at_draws = VariableAtDraws(model, variable, draws)
         records = zip(at_draws.records, at_draws.generators(rng), strict=True)
         with at_draws.progress("predictions", enabled=progressbar, n_tasks=3):
@@ -167,10 +177,21 @@ def filter_diagnostics(
         parts.append(part)
         healths = [one.health for one in found]
         at_draws.warn_about([one.health for one in healths], [one.seeds for one in healths])
-    attrs = {"predictions": PREDICTION_NOTE}
+    n_used, n_all = (int(np.prod(one.shape)) for one in (draws, every))
+    attrs = {"predictions": PREDICTION_NOTE, "draws": f"{n_used} of {n_all}"}
     for verdict in stored(idata, model, OFF) if filter is None else ():
         warnings.warn(verdict, FilterWarning, skip_file_prefixes=INSIDE)
     return add_group(idata, "filter_diagnostics", xr.merge(parts), attrs, extend_inferencedata)
+
+
+def _most_draws(variables: list[StateSpaceVariable]) -> int:
+    """How many draws the numbers allow that the rows of the variables need at each."""
+    n_numbers = 0
+    for variable in variables:
+        n, p = variable.system.n, variable.system.p
+        n_rows = len(variable.steps.eval(mode="FAST_COMPILE"))
+        n_numbers += n_rows * (4 * n + p + p**2)
+    return max(_LEAST_DRAWS, int(_MOST_NUMBERS / n_numbers))
 
 
 class _Found(NamedTuple):

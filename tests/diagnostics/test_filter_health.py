@@ -7,6 +7,7 @@ import pytensor
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.diagnostics import filter_health
 from pymc_statespace_filters.diagnostics.calibration import uniformity_of
 from tests.diagnostics.records import SYSTEM
 from tests.references.linear_states import linear_states
@@ -83,6 +84,19 @@ def test_the_group_has_its_dimensions_and_gaps_of_the_record():
     np.testing.assert_array_equal(found["d_time"], STEPS)
     assert found["d_failed"] == found["d_collapsed"] == 0
     assert "given all observations" in found.attrs["predictions"]
+
+
+def test_a_long_record_takes_a_share_of_the_draws_and_says_so(long_record, monkeypatch):
+    every = diagnosed(SYSTEM, psf.EKF(), long_record, LONG, **TRUTH)
+    assert every.attrs["draws"] == "200 of 200"
+    # Six numbers of each row: n = p = 1.
+    monkeypatch.setattr(filter_health, "_MOST_NUMBERS", 100 * 6 * LONG.size)
+    share = diagnosed(SYSTEM, psf.EKF(), long_record, LONG, **TRUTH)
+    assert share.attrs["draws"] == "100 of 200"
+    assert share["d_predicted"].shape[:2] == (2, 50)
+    np.testing.assert_allclose(share["d_pit"], every["d_pit"], rtol=1e-10)
+    monkeypatch.setattr(filter_health, "_MOST_NUMBERS", 1)
+    assert diagnosed(SYSTEM, psf.EKF(), long_record, LONG, **TRUTH).attrs["draws"] == "40 of 200"
 
 
 def test_a_right_model_passes(long_record):
