@@ -14,16 +14,18 @@ from arviz_plots.visuals import labelled_title, labelled_x, labelled_y, line_xy
 from ..errors import ModelError
 from .canvas import (
     BOUND,
-    add_legend,
     band,
     canvas,
     curve,
     format_probability,
     size_of_panels,
+    style_of_curve,
     with_unit,
 )
+from .legend import add_legend
 
 AVERAGE = "average"
+AES = ["color", "linestyle", "width"]
 N_GRID = 512
 ENDS = {"width": 1.5, "linestyle": "C1"}  # of the interval of the average
 PROB_SHOWN = 1e-3  # models above this probability determine the x range of densities
@@ -93,16 +95,20 @@ def plot_average(
     data = _means(members, mixture) if along else _densities(members)
     panels = [dim for dim in members[name].dims if dim not in ("model", "chain", "draw", *along)]
     n_members = members.sizes["model"]
+    styles = [style_of_curve(i) for i in range(n_members)]
+    intervals = _legend_of_intervals() if along else {}
     n_panels = math.prod(members.sizes[dim] for dim in panels)
     collection = canvas(
         data,
         backend=backend,
         pc_kwargs=pc_kwargs,
-        aes={"color": ["model"], "width": ["model"]},
+        aes={name: ["model"] for name in AES},
         size=size_of_panels(n_panels),
         n_panels=n_panels,
+        key=[*_labels_of_models(members).values(), *intervals],
         cols=panels,
-        color=["B1", *(f"C{i}" for i in range(n_members))],
+        color=["B1", *(style["color"] for style in styles)],
+        linestyle=["C0", *(style["linestyle"] for style in styles)],
         width=[4, *[1.5] * n_members],
     )
     if panels:
@@ -117,8 +123,7 @@ def plot_average(
     labels = (_axis_label(mixture[along[0]]), quantity) if along else (quantity, "density")
     collection.map(labelled_x, "x_label", ignore_aes="all", text=labels[0])
     collection.map(labelled_y, "y_label", ignore_aes="all", text=labels[1])
-    legend = _legend_of_models(collection, members)
-    add_legend(collection, legend | (_legend_of_intervals() if along else {}), bool(panels))
+    add_legend(collection, _legend_of_models(collection, members) | intervals)
     return collection
 
 
@@ -133,12 +138,12 @@ def _draw_curves(collection: PlotCollection, members: xr.Dataset, mixture: xr.Da
     of_members, of_average = (
         getattr(draws.azstats, rcParams["stats.ci_kind"])() for draws in (members, mixture)
     )
-    styled = {"ignore_aes": {"width"}, **ENDS}
-    collection.map(band, "band", data=of_members, ignore_aes={"width"}, alpha=0.2)
+    ignored = {"ignore_aes": {"width", "linestyle"}}
+    collection.map(band, "band", data=of_members, alpha=0.2, **ignored)
     collection.map(curve, "curve")
     for end in ("lower", "upper"):
         ends = of_average.sel({BOUND: end}).expand_dims(model=[AVERAGE])
-        collection.map(curve, end, data=ends, **styled)
+        collection.map(curve, end, data=ends, **ENDS, **ignored)
 
 
 def _numeric_dims(array: xr.DataArray) -> list[Hashable]:
@@ -182,13 +187,17 @@ def _densities(members: xr.Dataset) -> xr.Dataset:
     return densities.assign_coords(coords).to_dataset(name=kernel_densities.name)
 
 
-def _legend_of_models(collection: PlotCollection, members: xr.Dataset) -> dict[str, dict[str, Any]]:
-    """Return the styles of the average and of the models, these with their probabilities."""
+def _labels_of_models(members: xr.Dataset) -> dict[str, str]:
+    """Return the entries of the average and of the models, these with their probabilities."""
     probs = zip(members["model"].values, members["prob"].values, strict=True)
-    labels = {AVERAGE: AVERAGE} | {name: f"{name} ({format_probability(p)})" for name, p in probs}
+    return {AVERAGE: AVERAGE} | {name: f"{name} ({format_probability(p)})" for name, p in probs}
+
+
+def _legend_of_models(collection: PlotCollection, members: xr.Dataset) -> dict[str, dict[str, Any]]:
+    """Return the styles of the average and of the models."""
     return {
-        label: dict(collection.get_aes_kwargs(["color", "width"], "mapping", {"model": name}))
-        for name, label in labels.items()
+        label: dict(collection.get_aes_kwargs(AES, "mapping", {"model": name}))
+        for name, label in _labels_of_models(members).items()
     }
 
 

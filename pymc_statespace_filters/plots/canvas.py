@@ -1,8 +1,8 @@
-"""Elements shared by the plots: figures, axes, labelled rows, legends, curves, annotations."""
+"""Elements shared by the plots: figures, axes, labelled rows, curves, annotations."""
 
 import math
 from collections.abc import Mapping, Sequence
-from importlib import import_module
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -12,18 +12,17 @@ from arviz_plots import PlotCollection
 from arviz_plots.plot_collection import backend_from_object
 from arviz_plots.visuals import labelled_x
 
+from .legend import DOTS_PER_INCH, further_lines
+
 STEPS = (1.0, 2.0, 5.0, 10.0)  # between ticks, times a power of ten
 
+N_COLORS = 8  # that every backend tells apart
 BOUND = "ci_bound"
 PANELS_IN_LINE = 4
+TITLE_WIDTH, TITLE_SIZE = 36, 10  # of a line in letters, and of a letter in points
+LONGEST_NAME = 24  # in letters, of an axis
 # Of an axis, at most: between them labels of years have room.
 N_TICKS, TICKS_PER_INCH = 8, 1.4
-DOTS_PER_INCH = 100
-# Width in dots of a letter, and of the sample line with the gaps of an entry; of matplotlib with
-# letters of ten points.
-LETTER = {"matplotlib": 7.5, "bokeh": 6.2}
-TITLE, MARGINS = 30.0, 150.0  # heights in dots, of plotly
-SAMPLE = {"matplotlib": 65.0, "bokeh": 34.0}
 
 
 def with_unit(label: str, unit: str | None) -> str:
@@ -59,13 +58,27 @@ def time_label(*arrays: xr.DataArray | None) -> str:
     return with_unit("time", next((str(unit) for unit in units if unit is not None), None))
 
 
-def label_axes(collection: PlotCollection, names: Sequence[str], time: str) -> None:
-    """Label the y axis of each panel, and the time axis below the lowest panels."""
+def label_axes(
+    collection: PlotCollection, names: Sequence[str], time: str, titles: Sequence[str] = ()
+) -> None:
+    """Label the y axis of each panel, and the time axis below the lowest panels.
+
+    ``titles`` are the records in the names. A name that is longer than its axis is a title too.
+    """
+    short = list(names)
+    if titles:
+        short = [name.replace(f"{one}: ", "", 1) for name, one in zip(names, titles, strict=True)]
+    if max(map(len, short)) > LONGEST_NAME:
+        titles, short = names, [""] * len(short)
     (dim,) = collection.viz["plot"].dims
-    texts = xr.DataArray(list(names), coords={dim: collection.data[dim]}, dims=[dim])
+    texts = xr.DataArray(short, coords={dim: collection.data[dim]}, dims=[dim])
     panels = xr.zeros_like(texts, dtype=float).to_dataset(name=next(iter(collection.data)))
-    collection.map(label_y, "y_label", data=panels, ignore_aes="all", texts=texts)
     n_columns = int(collection.viz["col_index"].max()) + 1
+    if titles:
+        width = TITLE_WIDTH if n_columns > 1 else 2 * TITLE_WIDTH
+        broken = texts.copy(data=[fill(title, width) for title in titles])
+        collection.map(label_title, "title", data=panels, ignore_aes="all", texts=broken)
+    collection.map(label_y, "y_label", data=panels, ignore_aes="all", texts=texts)
     lowest = panels.isel({dim: slice(-n_columns, None)})
     settings = {"ignore_aes": "all", "store_artist": False}
     collection.map(labelled_x, data=lowest, text=time, **settings)
@@ -88,6 +101,13 @@ def shorten_dates(collection: PlotCollection) -> None:
 def label_y(da: xr.DataArray, target: Any, *, texts: xr.DataArray, **kwargs: Any) -> Any:
     """Label the y axis of a panel with its text."""
     return backend_from_object(target).ylabel(texts.item(), target, **kwargs)
+
+
+def label_title(da: xr.DataArray, target: Any, *, texts: xr.DataArray, **kwargs: Any) -> Any:
+    """Write the title of a panel, whose lines every backend breaks in its own way."""
+    drawing = backend_from_object(target)
+    line = "<br>" if drawing.__name__.endswith("plotly") else "\n"
+    return drawing.title(texts.item().replace("\n", line), target, size=TITLE_SIZE, **kwargs)
 
 
 def label_x(da: xr.DataArray, target: Any, *, texts: xr.DataArray, **kwargs: Any) -> Any:
@@ -146,6 +166,7 @@ def canvas(
     size: tuple[float, float],
     n_panels: int = 1,
     panels_in_line: int = PANELS_IN_LINE,
+    key: Sequence[str] = (),
     **defaults: Any,
 ) -> PlotCollection:
     """Make an empty figure for `data`; `pc_kwargs` of the user override the defaults.
@@ -159,6 +180,8 @@ def canvas(
     size : tuple of float
         Width and height of the figure in inches.
     n_panels, panels_in_line : int
+    key : sequence of str
+        Entries of a legend, for whose further lines the figure is higher.
     **defaults
         Default arguments of `PlotCollection.wrap`.
     """
@@ -167,7 +190,8 @@ def canvas(
     if "figsize" not in figure:
         in_inches = backend == "matplotlib"
         scale = 1.0 if in_inches else DOTS_PER_INCH
-        figure["figsize"] = (scale * size[0], scale * size[1])
+        height = size[1] + further_lines(key, size[0])
+        figure["figsize"] = (scale * size[0], scale * height)
         figure["figsize_units"] = "inches" if in_inches else "dots"
     if backend == "matplotlib":  # the only backend that needs it to make room for a legend
         figure.setdefault("layout", "constrained")
@@ -216,6 +240,11 @@ def canvas_of_rows(
     names = [str(name) for name in data[dim].values]
     collection.map(label_rows, ignore_aes="all", places=places, names=names, store_artist=False)
     return collection
+
+
+def style_of_curve(i: int) -> dict[str, str]:
+    """Return colour and line of a curve, of which no two of 32 curves share both."""
+    return {"color": f"C{i % N_COLORS}", "linestyle": f"C{i // N_COLORS}"}
 
 
 def curve(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
@@ -271,76 +300,3 @@ def format_probability(prob: float) -> str:
     if prob < 0.01:
         return f"{prob:.1g}"
     return f"{prob:.2f}" if prob < 0.99 else f"{prob:.4f}"
-
-
-def legend_style(style: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the legend style of points: a dotted line, as legends show lines only."""
-    return {**style, "linestyle": "C2", "width": 4}
-
-
-def add_legend(
-    collection: PlotCollection, entries: Mapping[str, Mapping[str, Any]], titled: bool = False
-) -> None:
-    """Write a legend above the panels, and above their titles if they are `titled`."""
-    backend, labels = collection.backend, list(entries)
-    in_line = len(labels)
-    if backend in LETTER:
-        in_line = _entries_in_line(labels, backend, _width(collection))
-    places: dict[str, dict[str, Any]] = {
-        "matplotlib": {"loc": "outside upper center", "frameon": False, "ncols": in_line},
-        "plotly": {  # which breaks the line itself
-            "legend_orientation": "h",
-            "legend_y": 1.02 if not titled else 1.0 + TITLE / _height(collection),
-            "legend_yanchor": "bottom",
-            "legend_traceorder": "normal",
-            "margin": {"t": 60 + (TITLE if titled else 0), "b": 60, "r": 30},
-        },
-        "bokeh": {  # above one panel, and no wider than it
-            "side": "above",
-            "border_line_alpha": 0.0,
-            "margin": 0,
-            "padding": 0,
-            "ncols": in_line,
-            "label_text_font_size": "11px",
-            "glyph_width": 18,
-        },
-        "none": {},
-    }
-    # arviz_plots does not translate "alpha" for legends.
-    alpha = "opacity" if backend == "plotly" else "alpha"
-    styles = [{alpha if k == "alpha" else k: v for k, v in s.items()} for s in entries.values()]
-    drawing = import_module(f"arviz_plots.backend.{backend}")
-    drawing.legend(collection, styles, labels, update_visuals=False, **places[backend])
-
-
-def _width(collection: PlotCollection) -> float:
-    """Return the room for the legend in dots: the figure's width, or that of a panel of bokeh.
-
-    That of matplotlib is relative to its letters, whose size is a matter of style.
-    """
-    if collection.backend == "bokeh":
-        return float(collection.iget_target(0, -1).width)
-    matplotlib = import_module("matplotlib")
-    size = import_module("matplotlib.font_manager").FontProperties(
-        size=matplotlib.rcParams["legend.fontsize"]
-    )
-    inches = collection.viz["figure"].item().get_size_inches()[0]
-    return float(DOTS_PER_INCH * inches * 10.0 / size.get_size_in_points())
-
-
-def _height(collection: PlotCollection) -> float:
-    """Return the height of the panels of a plotly figure in dots."""
-    if collection.backend != "plotly":
-        return DOTS_PER_INCH
-    height = collection.viz["figure"].item().layout.height
-    return float(max((height or 450) - MARGINS, DOTS_PER_INCH))
-
-
-def _entries_in_line(labels: Sequence[str], backend: str, width: float) -> int:
-    """Return the largest number of legend columns that fit into `width` dots."""
-    lengths = [len(label) for label in labels]
-    for n_columns in range(len(labels), 1, -1):
-        widest = [max(column) for column in np.array_split(lengths, n_columns)]
-        if sum(LETTER[backend] * n + SAMPLE[backend] for n in widest) <= width:
-            return n_columns
-    return 1

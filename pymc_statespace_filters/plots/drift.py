@@ -12,7 +12,8 @@ from arviz_plots.visuals import hline
 from ..diagnostics.constancy.table import DriftScan
 from ..errors import ModelError
 from ..former_names import former_names
-from .canvas import add_legend, band, curve, interval, label_axes, legend_style, time_label
+from .canvas import band, curve, interval, label_axes, time_label
+from .legend import add_legend, legend_style
 from .marks import canvas_over_time, points
 from .results import select_names
 
@@ -43,7 +44,8 @@ def plot_drift(
     scan : pandas.DataFrame
         The result of `drift_scan`.
     parameters : str or sequence of str, optional
-        Those to show; by default the first twelve of the table.
+        Those to show; by default the first twelve of the table that have scores. One at a bound
+        may have none.
     record : label, optional
         The record of a panel, which has a figure of its own; by default the most suspicious one.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
@@ -89,10 +91,14 @@ def plot_drift(
             "scan must be the result of drift_scan, of which a part has no paths, got "
             f"{type(scan).__name__}"
         )
-    names = [str(name) for name in scan.index]
+    paths = _of_record(scan, record)
+    known = paths["cumulated"].notnull().any("time")
+    names = [str(name) for name in scan.index if known.sel(parameter=name)]
     shown = select_names("parameters", parameters, names)
     shown = shown[:MOST_PANELS] if parameters is None else shown
-    paths = _of_record(scan, record).sel(parameter=shown)
+    if not shown:
+        raise ModelError(f"scan has summed scores of none of {list(scan.index)}: nothing to plot")
+    paths = paths.sel(parameter=shown)
     sums = paths[["cumulated"]]
     collection = canvas_over_time(sums, "parameter", 1, backend=backend, pc_kwargs=pc_kwargs)
     bound = xr.ones_like(sums) * paths["band"]
@@ -108,7 +114,7 @@ def plot_drift(
         "95 % of constant parameters": {**CONSTANT, "width": 8},
         "time of the change": legend_style({"color": TURN["color"]}),
     }
-    add_legend(collection, legend, len(shown) > 1)
+    add_legend(collection, legend)
     return collection
 
 

@@ -14,15 +14,8 @@ from arviz_plots.visuals import labelled_x, line_x, scatter_x, set_xlim, set_xti
 from ..errors import ModelError
 from ..evidence import Evidence
 from ..system.checks import shortened
-from .canvas import (
-    add_legend,
-    annotate,
-    canvas_of_rows,
-    format_probability,
-    interval,
-    legend_style,
-    linear_ticks,
-)
+from .canvas import annotate, canvas_of_rows, format_probability, interval, linear_ticks
+from .legend import add_legend, legend_style
 
 N_TICKS = 5  # numbers of many digits beside each other
 

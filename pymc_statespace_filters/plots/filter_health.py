@@ -19,20 +19,19 @@ from scipy.stats import norm
 from ..former_names import former_names
 from .canvas import (
     PANELS_IN_LINE,
-    add_legend,
     band,
     canvas,
     curve,
     interval,
     label_ticks,
-    legend_style,
     logarithmic_ticks,
     shorten_dates,
     time_label,
 )
+from .legend import add_legend, legend_style
 from .marks import bars, draw_bands, draw_median, over_draws, point_size, points
 from .panels import one_record
-from .results import group_of, rename_last_dims, variable_of
+from .results import group_of, rename_last_dims, seen_observables, variable_of
 
 COLLAPSED = 3  # effective particles below which a filter counts as collapsed
 PROB, TAIL = 0.95, 1.96  # of the bands expected of a calibrated filter
@@ -71,6 +70,8 @@ def plot_filter_health(
       furthest from zero is drawn at each lag. Outside the band the inputs act otherwise than in the
       model.
 
+    An observable without observations and inputs that never change have no panel.
+
     For particle and ensemble filters, one more panel with the effective number of particles behind
     each term of the log-likelihood, over the draws. Below 3 (the dashed line) the filter has
     collapsed. Its title is the number of
@@ -99,7 +100,7 @@ def plot_filter_health(
     Raises
     ------
     ModelError
-        If `idata` has no such group, or `var_name` is none of its variables.
+        If `idata` has no such group or no observation, or `var_name` is none of its variables.
 
     References
     ----------
@@ -131,6 +132,9 @@ def plot_filter_health(
     name = variable_of(results, var_name, "_residual")
     idata = one_record(idata, "filter_diagnostics", name, record)
     results = idata["filter_diagnostics"].to_dataset()
+    seen_ones = seen_observables(results[f"{name}_residual"])
+    n_observables = seen_ones.size
+    results = results.isel({results[f"{name}_residual"].dims[-1]: seen_ones})
     residual, pit = (
         rename_last_dims(results[f"{name}_{kind}"], "time", "observable")
         for kind in ("residual", "pit")
@@ -138,13 +142,14 @@ def plot_filter_health(
     panels = [_residuals(residual), _autocorrelations(residual), _pits(pit)]
     if f"{name}_input_correlation" in results:
         panels.append(_input_correlations(results, name, residual))
+    panels = [panel for panel in panels if panel[0].to_array().notnull().any()]
     seen, expected = (xr.merge(parts) for parts in zip(*panels, strict=True))
     effective = _log_effective(results, name)
     data = seen if effective is None else seen.assign(effective=effective)
 
-    n_observables = residual.sizes["observable"]
-    n_panels = len(panels) * n_observables + (effective is not None)
-    in_line = 2 if n_observables == 1 else min(n_observables, PANELS_IN_LINE)
+    n_columns = residual.sizes["observable"]
+    n_panels = len(panels) * n_columns + (effective is not None)
+    in_line = 2 if n_columns == 1 else min(n_columns, PANELS_IN_LINE)
     collection = canvas(
         data,
         backend=backend,
@@ -167,9 +172,9 @@ def plot_filter_health(
     if effective is not None:
         legend |= _draw_effective(collection, data[["effective"]])
         _note_failures(collection, data[["effective"]], idata)
-    _label_panels(collection, data, time_label(residual))
+    _label_panels(collection, data, time_label(residual), n_observables)
     shorten_dates(collection)
-    add_legend(collection, legend, n_observables > 1)
+    add_legend(collection, legend)
     return collection
 
 
@@ -286,7 +291,9 @@ def _note_failures(collection: PlotCollection, logs: xr.Dataset, idata: xr.DataT
         collection.map(labelled_title, "failures", data=logs, text=text, ignore_aes="all")
 
 
-def _label_panels(collection: PlotCollection, data: xr.Dataset, time: str) -> None:
+def _label_panels(
+    collection: PlotCollection, data: xr.Dataset, time: str, n_observables: int
+) -> None:
     axes = {
         "residual": (time, "standardised residual"),
         "autocorrelation": ("lag (observations)", "autocorrelation"),
@@ -299,7 +306,7 @@ def _label_panels(collection: PlotCollection, data: xr.Dataset, time: str) -> No
         x_label, y_label = axes[panel]
         collection.map(labelled_x, data=data[[panel]], text=x_label, **settings)
         collection.map(labelled_y, data=data[[panel]], text=y_label, **settings)
-    if data.sizes["observable"] > 1:
+    if n_observables > 1:
         of_observables = data.drop_vars("effective", errors="ignore")
         labels = {"labeller": NoVarLabeller(), "subset_info": True}
-        collection.map(labelled_title, data=of_observables, **labels, **settings)
+        collection.map(labelled_title, "title", data=of_observables, ignore_aes="all", **labels)

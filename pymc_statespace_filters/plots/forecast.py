@@ -11,7 +11,8 @@ from arviz_plots.visuals import vline
 from ..errors import ModelError
 from ..former_names import former_names
 from ..system.checks import check_count
-from .canvas import add_legend, label_axes, legend_style, time_label
+from .canvas import label_axes, time_label
+from .legend import add_legend, legend_style
 from .marks import (
     DATA,
     TRUTH,
@@ -161,7 +162,7 @@ def plot_forecast(
     if truth is not None and not errors:
         legend |= _draw_truth(collection, truth, record, draws)
     lines = {} if at_one_time else draw_median(collection, quantiles)
-    label_axes(collection, labels, time)
+    label_axes(collection, labels, time, facets.records_of(observables))
     add_legend(collection, lines | bands | legend)
     return collection
 

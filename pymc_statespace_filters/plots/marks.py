@@ -9,7 +9,8 @@ from arviz_plots import PlotCollection
 from arviz_plots.plot_collection import backend_from_object
 
 from ..errors import ModelError
-from .canvas import BOUND, band, canvas, curve, interval, legend_style, unit_of, with_unit
+from .canvas import BOUND, band, canvas, curve, interval, unit_of, with_unit
+from .legend import legend_style
 from .results import SAMPLE_DIMS, check_names
 
 # Blue and orange are distinguishable with colour-vision deficiency; the truth is black.
@@ -35,6 +36,7 @@ def canvas_over_time(
     *,
     backend: str | None,
     pc_kwargs: Mapping[str, Any],
+    key: Sequence[str] = (),
 ) -> PlotCollection:
     """Make a figure with one panel per entry of `dim`, so many beside each other."""
     n_panels = data.sizes[dim]
@@ -47,6 +49,7 @@ def canvas_over_time(
         size=(7.0 if panels_in_line == 1 else 3.6 * panels_in_line, 1.3 + 2.0 * n_lines**0.9),
         n_panels=n_panels,
         panels_in_line=panels_in_line,
+        key=key,
         cols=[dim],
     )
 

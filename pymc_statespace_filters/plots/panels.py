@@ -99,6 +99,11 @@ class Facets(NamedTuple):
         rows = [found.isel({found.dims[0]: of_rows == label}) for label in self.labels]
         return _side_by_side([_over_times(own, time) for own in rows], self.labels)
 
+    def records_of(self, names: Sequence[str]) -> list[str]:
+        """The record of each name that has one; nothing without a panel."""
+        found = [[one for one in self.labels if n.startswith(named(one, ""))] for n in names]
+        return [max(map(str, labels), key=len) for labels in found if labels]
+
     def connected(self, quantiles: xr.Dataset) -> xr.Dataset:
         """Quantiles without gaps at the times of other records."""
         return quantiles.interpolate_na("time") if self.labels else quantiles

@@ -11,7 +11,8 @@ from arviz_plots.visuals import labelled_x, labelled_y, line_xy
 from ..errors import ModelError
 from ..former_names import former_names
 from ..system.checks import check_count
-from .canvas import add_legend, canvas, unit_of, with_unit
+from .canvas import canvas, unit_of, with_unit
+from .legend import add_legend
 from .marks import DOTS, PATHS, TRUTH, over_draws, path_xy, points_xy, thin_draws
 from .panels import one_record
 from .results import SAMPLE_DIMS, name_of_states, select_names, states_of, truth_of

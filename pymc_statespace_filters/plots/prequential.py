@@ -9,7 +9,8 @@ from arviz_plots import PlotCollection
 from arviz_plots.plot_collection import backend_from_object
 
 from ..parameter_particles import compare_prequential
-from .canvas import add_legend, band, curve, interval, label_axes
+from .canvas import band, curve, interval, label_axes, style_of_curve
+from .legend import add_legend
 from .marks import canvas_over_time
 
 N_ERRORS = 2  # of standard errors, of a band
@@ -78,13 +79,15 @@ def plot_prequential(
     models = [str(name) for name in table["model"].values]
     first = table[PANELS[0]].isel(model=0, drop=True)
     shape = xr.Dataset({"value": first.expand_dims(panel=list(PANELS))})
-    collection = canvas_over_time(shape, "panel", 1, backend=backend, pc_kwargs=pc_kwargs)
-    styles = {name: {"color": f"C{i}"} for i, name in enumerate(models)}
+    texts = [f"{models[0]} (reference)", *models[1:]]
+    collection = canvas_over_time(
+        shape, "panel", 1, backend=backend, pc_kwargs=pc_kwargs, key=texts
+    )
+    styles = {name: style_of_curve(i) for i, name in enumerate(models)}
     for name, style in styles.items():
         _draw_model(collection, table.sel(model=name, drop=True), name, style)
     labels = ["score difference", "log Bayes factor", "probability"]
     label_axes(collection, labels, "time")
-    texts = [f"{models[0]} (reference)", *models[1:]]
     entries = {t: {**style, "width": 2} for t, style in zip(texts, styles.values(), strict=True)}
     add_legend(collection, entries)
     return collection
@@ -108,7 +111,7 @@ def _draw_model(
     collection.map(stems, f"score_{name}", data=in_panel(PANELS[0], scores), width=1.5, **style)
     for short, (panel, low, high) in bounds.items():
         ends = interval(in_panel(panel, low), in_panel(panel, high))
-        collection.map(band, f"{short}_band_{name}", data=ends, alpha=0.25, **style)
+        collection.map(band, f"{short}_band_{name}", data=ends, alpha=0.25, color=style["color"])
         values = in_panel(panel, course[panel])
         collection.map(curve, f"{short}_{name}", data=values, width=1.5, **style)
 

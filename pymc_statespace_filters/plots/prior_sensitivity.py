@@ -11,8 +11,10 @@ from arviz_plots.visuals import labelled_x, labelled_y, set_xlim, set_xticks, se
 
 from ..errors import ModelError
 from ..evidence.comparison.scaled_prior import MAX_BEYOND, MAX_PARETO_K
-from .canvas import add_legend, band, canvas, curve, interval, logarithmic_ticks, size_of_panels
+from .canvas import band, canvas, curve, interval, logarithmic_ticks, size_of_panels, style_of_curve
+from .legend import add_legend
 
+AES = ["color", "linestyle"]
 ENDS = ("width_prob_low", "width_prob_high")
 LABEL_WIDTH, NOTE_WIDTH = 44, 32  # characters, of a line below the panel and inside it
 LINE = 0.22  # inches, of a line below a panel
@@ -73,22 +75,27 @@ def plot_prior_sensitivity(
     probs = found[["width_prob"]]
     low, high = (found[[name]].rename({name: "width_prob"}) for name in ENDS)
     width, height = size_of_panels(1)
+    models = [str(name) for name in probs["model"].values]
+    styles = [style_of_curve(i) for i in range(len(models))]
     collection = canvas(
         probs,
         backend=backend,
         pc_kwargs=pc_kwargs,
-        aes={"color": ["model"]},
+        aes={name: ["model"] for name in AES},
+        color=[style["color"] for style in styles],
+        linestyle=[style["linestyle"] for style in styles],
+        key=[*models, "interval"],
         size=(width, height + LINE * _about_priors(probs).count("\n")),
         n_panels=1,
         cols=["__variable__"],
     )
-    collection.map(band, "band", data=interval(low, high), alpha=0.25)
+    collection.map(band, "band", data=interval(low, high), alpha=0.25, ignore_aes={"linestyle"})
     collection.map(curve, "curve", width=2)
     _label_axes(collection, probs)
     _note_empty(collection, found)
     legend = {
-        str(name): {**collection.get_aes_kwargs(["color"], "mapping", {"model": name}), "width": 2}
-        for name in probs["model"].values
+        name: {**collection.get_aes_kwargs(AES, "mapping", {"model": name}), "width": 2}
+        for name in models
     }
     if low["width_prob"].notnull().any():
         share = f"{100 * found.attrs['ci_prob']:g} % " if "ci_prob" in found.attrs else ""

@@ -13,7 +13,6 @@ from ..diagnostics.calibration import standardised
 from ..errors import ModelError
 from ..former_names import former_names
 from .canvas import (
-    add_legend,
     band,
     canvas,
     few_ticks,
@@ -24,9 +23,17 @@ from .canvas import (
     unit_of,
     with_unit,
 )
+from .legend import add_legend
 from .marks import bars, point_size, points, points_xy
 from .panels import one_record
-from .results import SAMPLE_DIMS, data_of, group_of, rename_last_dims, variable_of
+from .results import (
+    SAMPLE_DIMS,
+    data_of,
+    group_of,
+    rename_last_dims,
+    seen_observables,
+    variable_of,
+)
 
 TAIL = 1.96  # of the 95 % band of a standard normal
 SEEN = {"color": "C0"}
@@ -59,6 +66,8 @@ def plot_residuals(
     * against the prediction: a curve shows a wrong restoring force or sensor law, a spread that
       grows with the amplitude shows noise that does.
 
+    An observable without observations and an input that never changes have no panel.
+
     Parameters
     ----------
     idata : xarray.DataTree
@@ -82,7 +91,7 @@ def plot_residuals(
     Raises
     ------
     ModelError
-        If `idata` has no such group, or `var_name` is none of its variables.
+        If `idata` has no such group or no observation, or `var_name` is none of its variables.
 
     See Also
     --------
@@ -119,7 +128,7 @@ def plot_residuals(
     results, data = idata["filter_diagnostics"].to_dataset(), data_of(idata, name)
     found = _innovations(results, name, data)
     panels = _panels(results, name, found)
-    n_columns = found.z.sizes["observable"]
+    n_columns = panels.sizes["observable"]
     width = WIDTH_ALONE if n_columns == 1 else WIDTH * n_columns
     collection = canvas(
         panels,
@@ -135,11 +144,12 @@ def plot_residuals(
     _draw_correlations(collection, panels, found.z)
     predicted = [
         f"predicted {with_unit(str(one), unit_of(one, found.z, data))}"
-        for one in found.z["observable"].values
+        for one in panels["observable"].values
     ]
-    _label_panels(collection, panels, predicted, time_label(found.z, data))
+    n_observables = found.z.sizes["observable"]
+    _label_panels(collection, panels, predicted, time_label(found.z, data), n_observables)
     shorten_dates(collection)
-    add_legend(collection, {"95 % if the model is right": {**EXPECTED, "width": 8}}, n_columns > 1)
+    add_legend(collection, {"95 % if the model is right": {**EXPECTED, "width": 8}})
     return collection
 
 
@@ -176,7 +186,8 @@ def _panels(results: xr.Dataset, name: str, found: Innovations) -> xr.Dataset:
     rows["prediction"] = xr.concat([found.predicted, found.z], "plot_axis").assign_coords(
         plot_axis=["x", "y"]
     )
-    return xr.Dataset({row: values.drop_attrs() for row, values in rows.items()})
+    known = {row: values.drop_attrs() for row, values in rows.items() if values.notnull().any()}
+    return xr.Dataset(known).isel(observable=seen_observables(found.z))
 
 
 def _draw_points(collection: PlotCollection, panels: xr.Dataset) -> None:
@@ -218,7 +229,11 @@ def strip(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
 
 
 def _label_panels(
-    collection: PlotCollection, panels: xr.Dataset, predicted: list[str], time: str
+    collection: PlotCollection,
+    panels: xr.Dataset,
+    predicted: list[str],
+    time: str,
+    n_observables: int,
 ) -> None:
     """Label the axes of each panel, and the columns if there are several."""
     settings: dict[str, Any] = {"ignore_aes": "all", "store_artist": False}
@@ -236,6 +251,7 @@ def _label_panels(
         else:
             collection.map(labelled_x, data=data, text=x_label, **settings)
         collection.map(labelled_y, data=data, text=y_label, **settings)
-    if panels.sizes["observable"] > 1:
+    if n_observables > 1:
         titles = {"labeller": NoVarLabeller(), "subset_info": True}
-        collection.map(labelled_title, data=panels[["innovation"]], **titles, **settings)
+        titled = panels[["innovation"]]
+        collection.map(labelled_title, "title", data=titled, ignore_aes="all", **titles)

@@ -1,5 +1,6 @@
 """Read and check the inputs of plots of states: groups, variables, observations, the truth."""
 
+import json
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -87,14 +88,23 @@ def select_names(argument: str, names: Any, available: Sequence[str]) -> list[st
 
 
 def measured_by(
-    observables: Mapping[str, str] | None, states: Sequence[str], available: Sequence[str]
+    observables: Mapping[str, str] | None,
+    states: Sequence[str],
+    available: Sequence[str],
+    sensors: Mapping[str, str],
 ) -> dict[str, str]:
-    """Return the observable of each measured state: the given ones, or those of its name."""
+    """Return the observable of each measured state: given, of its name, or else by the sensors."""
     if observables is None:
-        return {state: state for state in states if state in available}
+        of_name = {state: state for state in states if state in available}
+        return {state: one for state, one in sensors.items() if one in available} | of_name
     check_names("observables: its states", observables, states)
     check_names("observables: its values", observables.values(), available)
     return dict(observables)
+
+
+def sensors_of(draws: xr.DataArray) -> dict[str, str]:
+    """The observable that measures a state, where the equations of the draws tell."""
+    return dict(json.loads(draws.attrs.get("observables", "{}")))
 
 
 def observations_of(
@@ -104,6 +114,14 @@ def observations_of(
     there = record.sel(observable=list(measured.values()))
     there = there.rename(observable="state").assign_coords(state=list(measured))
     return there.reindex(state=list(states))
+
+
+def seen_observables(residual: xr.DataArray) -> np.ndarray:
+    """Whether each observable has a residual, of which there must be one."""
+    seen = residual.notnull().values.any(axis=0)
+    if not seen.any():
+        raise ModelError("there must be an observation to compare with its prediction, got none")
+    return seen
 
 
 def check_names(argument: str, names: Iterable[str], available: Sequence[str]) -> None:

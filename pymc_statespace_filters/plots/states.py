@@ -9,8 +9,9 @@ from arviz_plots import PlotCollection
 from ..errors import ModelError
 from ..former_names import former_names
 from ..system.checks import check_count
-from .canvas import add_legend, curve, label_axes, time_label
+from .canvas import curve, label_axes, time_label
 from .finite import draw_ribbons, is_continuous, ribbons
+from .legend import add_legend
 from .marks import (
     DOTS,
     DRAWS,
@@ -31,13 +32,14 @@ from .marks import (
     thin_draws,
     transformed,
 )
-from .panels import facets_of_simulation, several_records
+from .panels import Facets, facets_of_simulation, several_records
 from .results import (
     data_of,
     measured_by,
     name_of_states,
     observations_of,
     select_names,
+    sensors_of,
     states_of,
     truth_of,
 )
@@ -89,7 +91,8 @@ def plot_states(
         Names of the states to show; all by default.
     observables : mapping of str to str, optional
         Maps a state to the observable that measures it; its observations are shown in the panel as
-        points. By default each observable with the name of a state.
+        points. By default each observable with the name of a state, or whose sensor is that state
+        itself, as in ``observation=lambda x: [x[0]]``.
     truth : array_like or xarray.DataArray or xarray.Dataset, optional
         The result of `simulate`; a DataArray with a dimension ``state`` and another whose
         coordinate is time; or an array of shape (number of times, number of states). It is shown
@@ -146,7 +149,7 @@ def plot_states(
     _, draws, at_observations, are_paths = states_of(idata, group, name)
     all_states = [str(state) for state in draws["state"].values]
     shown = select_names("states", states, all_states)
-    record, measured = _record(idata, name, observables, all_states)
+    record, measured = _record(idata, name, observables, draws, facets)
     seen = [] if record is None else [str(one) for one in record["observable"].values]
     functions = functions_of(transform, all_states, seen)
     true = None if truth is None else _truth(truth, draws, functions, shown)
@@ -177,7 +180,7 @@ def plot_states(
         collection.map(curve, "truth", data=true.to_dataset(name="truth"), **TRUTH)
         legend = {"truth": TRUTH} | legend
     labels = [axis_label(state, functions, draws) for state in shown]
-    label_axes(collection, labels, time_label(draws, record))
+    label_axes(collection, labels, time_label(draws, record), facets.records_of(shown))
     add_legend(collection, lines | bands | legend)
     return collection
 
@@ -194,7 +197,11 @@ def _truth(
 
 
 def _record(
-    idata: xr.DataTree, name: str, observables: Mapping[str, str] | None, states: Sequence[str]
+    idata: xr.DataTree,
+    name: str,
+    observables: Mapping[str, str] | None,
+    draws: xr.DataArray,
+    facets: Facets,
 ) -> tuple[xr.DataArray | None, dict[str, str]]:
     """Return the observations if idata has them, and the observable of each measured state."""
     record = data_of(idata, name)
@@ -202,8 +209,9 @@ def _record(
         if observables:
             raise ModelError(f"observables needs observed_data[{name!r}] in idata, got none")
         return None, {}
-    there = [str(observable) for observable in record["observable"].values]
-    return record, measured_by(observables, states, there)
+    states, there = ([str(one) for one in a[a.dims[-1]].values] for a in (draws, record))
+    sensors = facets.mapping(sensors_of(draws), to_names=True)
+    return record, measured_by(observables, states, there, sensors)
 
 
 def refuse_without_draws(**given: Any) -> None:
@@ -232,7 +240,7 @@ def draw_simulation(
     states, transform = facets.names(states), facets.mapping(transform)
     observables = facets.mapping(observables, to_names=True)
     all_states, seen = ([str(n) for n in a[a.dims[-1]].values] for a in (path, record))
-    measured = measured_by(observables, all_states, seen)
+    measured = measured_by(observables, all_states, seen, {})
     shown = select_names("states", states, all_states)
     if states is None:  # an observable that measures no state has a panel
         alone = [one for one in seen if one not in measured.values() and one not in all_states]
@@ -253,6 +261,6 @@ def draw_simulation(
         legend = draw_data(collection, observations_of(record, measured, panels))
     collection.map(curve, "path", **PATH)
     labels = [axis_label(one, functions, path, record) for one in panels]
-    label_axes(collection, labels, time_label(path, record))
+    label_axes(collection, labels, time_label(path, record), facets.records_of(panels))
     add_legend(collection, {"path": PATH} | legend)
     return collection

@@ -8,15 +8,9 @@ from arviz_plots import PlotCollection
 from arviz_plots.visuals import labelled_x, line_x, scatter_x, set_xlim
 
 from ..errors import ModelError
-from .canvas import (
-    add_legend,
-    annotate,
-    canvas_of_rows,
-    format_probability,
-    interval,
-    legend_style,
-)
+from .canvas import annotate, canvas_of_rows, format_probability, interval
 from .evidence import ends
+from .legend import add_legend, legend_style
 
 STYLE = {"color": "C0"}
 PRIOR = {"color": "B3", "width": 2}

@@ -1,4 +1,7 @@
-"""The law of an observation given the state or its moments, of one system at many points."""
+"""The law of an observation given the state or its moments, of one system at many points.
+
+And which observables are a state, but for their noise.
+"""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -9,8 +12,12 @@ import pytensor
 import pytensor.tensor as pt
 from numpy.typing import NDArray
 
+from ..compiler.codegen.expressions import Expression
+from ..compiler.codegen.function_types import Graph
+from ..compiler.codegen.functions import unrolled
+from ..compiler.codegen.scalarize import NotUnrollableError
 from ..compiler.lowering.compiled_system import compile_system
-from ..compiler.lowering.symbols import observation_moments, symbols_of
+from ..compiler.lowering.symbols import call, observation_moments, symbols_of
 from ..compiler.native.rows import at_points
 from ..system.model import StateSpaceModel
 
@@ -54,6 +61,25 @@ def moments_of_observations(
         np.where(unknown[:, None], np.nan, mean),
         np.where(unknown[:, None, None], np.nan, cov),
     )
+
+
+def sensors_of_states(system: StateSpaceModel) -> dict[str, str]:
+    """The first observable of each state that is that state, but for its noise."""
+    symbols, observation = symbols_of(system), system.equations.observation
+    if observation is None:
+        return {}
+    without_noise = {name: symbol for name, symbol in symbols.items() if name != "e"}
+    try:
+        (seen,) = unrolled(Graph(symbols, [call(observation, system, without_noise)]))
+    except NotUnrollableError:
+        return {}
+    states = {f"x.{i}": state for i, state in enumerate(system.states)}
+    found: dict[str, str] = {}
+    for value, observable in zip(seen, system.observables, strict=True):
+        name = value.args[0] if isinstance(value, Expression) and value.op is None else None
+        if name in states:
+            found.setdefault(states[name], observable)
+    return found
 
 
 @lru_cache(maxsize=64)

@@ -1,5 +1,6 @@
 """Filtered and smoothed states at draws of the posterior."""
 
+import json
 from typing import Any
 
 import numpy as np
@@ -7,6 +8,7 @@ import pymc as pm
 import xarray as xr
 
 from ..pymc_model.in_step import shared_by_ranks
+from ..pymc_model.observation_moments import sensors_of_states
 from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.state_space_variable import observed_variables, smoothing_method
 from ..system.checks import check_random_seed
@@ -210,7 +212,10 @@ def _add_states(
             },
             {**coords_of_steps(at_draws, steps), state: list(system.states)},
         )
-        part[f"{name}_states"].attrs = {"filter": repr(variable.filter)}
+        part[f"{name}_states"].attrs = {
+            "filter": repr(variable.filter),
+            "observables": json.dumps(sensors_of_states(system)),
+        }
         if moment == "smoothed":
             part[f"{name}_states"].attrs["smoothing"] = smoothing_method(variable)
         parts.append(part)

@@ -92,3 +92,22 @@ def test_two_dimensions_with_numbers_are_refused(draws):
 def test_what_is_refused(draws):
     with pytest.raises(ModelError, match="average must be a DataTree of average_models, got"):
         plot_average(draws["linear"])
+
+
+def test_a_legend_of_many_models_leaves_the_plot_its_height(draws):
+    """And no two curves have the colour and the line of another."""
+    heights = {}
+    for n_models in (2, 20):
+        models = {
+            f"stiffness with damping and hysteresis {i}": draws["cubic"] for i in range(n_models)
+        }
+        found = average_models(
+            models, dict.fromkeys(models, 1), lambda p: p["k"], n_draws=200, random_seed=1
+        )
+        figure = plot_average(found).viz["figure"].item()
+        figure.canvas.draw()
+        (axes,) = figure.axes
+        heights[n_models] = axes.bbox.height
+        lines = {(str(one.get_color()), one.get_linestyle()) for one in axes.get_lines()}
+        assert len(lines) == n_models + 1
+    assert heights[20] > 0.9 * heights[2]

@@ -158,3 +158,18 @@ def test_a_short_key_is_one_line(backend, states):
     else:
         (key,) = collection.iget_target(0, -1).legend
         assert key.ncols == len(key.items) == 4
+
+
+@pytest.mark.parametrize("backend", ["matplotlib", "plotly", "bokeh"])
+def test_the_key_of_points_is_a_point(backend, states):
+    collection = plot_states(states, backend=backend)
+    if backend == "matplotlib":
+        (point,) = collection.viz["figure"].item().legends[0].get_lines()[-1:]
+        assert (point.get_marker(), point.get_linestyle()) == ("o", "None")
+    elif backend == "plotly":
+        (point,) = collection.viz["figure"].item().select_traces({"name": "data"})
+        assert (point.mode, point.marker.symbol) == ("markers", "circle")
+    else:
+        (key,) = collection.iget_target(0, -1).legend
+        (point,) = key.items[-1].renderers
+        assert point.glyph.marker == "circle"

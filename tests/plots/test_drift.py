@@ -47,3 +47,16 @@ def test_what_is_refused(drift_scan):
         plot_drift(drift_scan, parameters="b")
     with pytest.raises(ModelError, match="record must be None without a panel, got 'A'"):
         plot_drift(drift_scan, record="A")
+
+
+def test_a_parameter_without_scores_has_no_panel(drift_scan):
+    """As one at a bound."""
+    paths = drift_scan.paths.copy(deep=True)
+    paths["cumulated"].loc["a"] = np.nan
+    scan = DriftScan(drift_scan, paths=paths)
+    assert list(drawn(plot_drift(scan, backend="none"), "sum")) == ["gain"]
+    with pytest.raises(ModelError, match=r"parameters must be among \['gain'\], got \['a'\]"):
+        plot_drift(scan, parameters="a")
+    nothing = DriftScan(drift_scan, paths=paths.where(False))
+    with pytest.raises(ModelError, match="scores of none"):
+        plot_drift(nothing)

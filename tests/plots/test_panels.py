@@ -245,3 +245,38 @@ def test_one_word_for_one_record_and_one_for_several(plot):
         plot(None, record="A")
     with pytest.raises(TypeError, match="has no argument 'records': give record="):
         plot_phase(None, "x", "y", records=["A"])
+
+
+NAMES = ["Mount Pleasant Elementary School", "Lake Constance (Bregenz gauge)", "x", "Patient 12"]
+NAMES += [f"Kilimanjaro, lower forest station {i}" for i in range(8)]
+
+
+@pytest.mark.parametrize("n_records", [2, 12])
+def test_long_names_of_records_are_titles_that_touch_nothing(n_records):
+    labels, of_rows = NAMES[:n_records], np.repeat(NAMES[:n_records], 3)
+    rows = {"d_panel": ("d_obs", of_rows), "d_time": ("d_obs", np.arange(3.0 * n_records) % 3)}
+    drawn = (("chain", "draw", "d_obs", "state"), RNG.normal(size=(2, 20, of_rows.size, 1)))
+    group = xr.Dataset({"d_states": drawn}, coords={**rows, "state": ["level"]})
+    figure = plot_states(xr.DataTree.from_dict({"smoothed_states": group})).viz["figure"].item()
+    figure.canvas.draw()
+    panels = figure.axes[:n_records]
+    assert [axes.get_title().replace("\n", " ") for axes in panels] == labels
+    assert {axes.get_ylabel() for axes in panels} == {"level"}
+    boxes = [axes.title.get_window_extent() for axes in panels]
+    boxes += [axes.yaxis.label.get_window_extent() for axes in panels]
+    boxes += [axes.bbox for axes in panels]
+    for i, box in enumerate(boxes):
+        assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1
+        assert not any(box.overlaps(other) for other in boxes[i + 1 :])
+
+
+def test_a_name_longer_than_its_axis_is_a_title():
+    name = "concentration_of_dissolved_oxygen"
+    drawn = (("chain", "draw", "d_time", "state"), RNG.normal(size=(2, 20, 5, 1)))
+    group = xr.Dataset({"d_states": drawn}, coords={"d_time": np.arange(5.0), "state": [name]})
+    collection = plot_states(xr.DataTree.from_dict({"smoothed_states": group}), backend="none")
+    (title,), (label,) = (
+        [one.item()["string"] for one in collection.viz[kind]["states"]]
+        for kind in ("title", "y_label")
+    )
+    assert (title, label) == (name, "")

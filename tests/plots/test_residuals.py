@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pymc_statespace_filters import plot_residuals
+from pymc_statespace_filters import plot_filter_health, plot_residuals
 from pymc_statespace_filters.errors import ModelError
 from tests.plots.conftest import TIMES
 from tests.plots.drawn import drawn
@@ -102,3 +102,21 @@ def test_what_is_refused(diagnostics):
     old = diagnostics["filter_diagnostics"].to_dataset()[["d_residual", "d_pit"]]
     with pytest.raises(ModelError, match=r"no innovations: run psf\.filter_diag"):
         plot_residuals(xr.DataTree.from_dict({"filter_diagnostics": old}))
+
+
+@pytest.mark.parametrize("plot", [plot_residuals, plot_filter_health])
+def test_what_has_no_value_has_no_panel(plot, diagnostics_with_inputs):
+    group = diagnostics_with_inputs["filter_diagnostics"].to_dataset().copy(deep=True)
+    for name in ("residual", "pit", "innovation", "autocorrelation", "input_correlation"):
+        group[f"d_{name}"].loc[{"observable": "speed"}] = np.nan
+    group["d_input_correlation"].loc[{"input": "heat"}] = np.nan
+    collection = plot(xr.DataTree.from_dict({"filter_diagnostics": group}), backend="none")
+    assert list(collection.data["observable"].values) == ["position"]
+    assert "input_heat" not in collection.data
+    assert all(collection.data[name].notnull().any() for name in collection.data)
+    group["d_input_correlation"][:] = np.nan  # no input ever changes
+    collection = plot(xr.DataTree.from_dict({"filter_diagnostics": group}), backend="none")
+    assert not {"inputs", "input_force"} & set(collection.data)
+    unseen = group.where(group["observable"] == "")
+    with pytest.raises(ModelError, match="must be an observation to compare"):
+        plot(xr.DataTree.from_dict({"filter_diagnostics": unseen}))

@@ -354,3 +354,16 @@ def test_what_is_refused(states):
     other = xr.DataArray(SINE[:, None], coords=[("time", TIMES), ("state", ["x0"])])
     with pytest.raises(ModelError, match=r"truth must have some of \['position', 'speed'\]"):
         plot_states(states, truth=other)
+
+
+def test_data_are_in_the_panel_of_the_state_that_their_sensor_is(states):
+    """Whatever they are called; the name of a state comes first, and a user's word before it."""
+    tree = states.copy()
+    tree["observed_data"] = states["observed_data"].to_dataset().assign_coords(observable=["y"])
+    assert "data" not in plot_states(tree, backend="none").viz.children
+    tree["smoothed_states"]["d_states"].attrs["observables"] = '{"speed": "y"}'
+    data = drawn(plot_states(tree, backend="none"), "data")
+    assert data["position"] is None
+    np.testing.assert_allclose(data["speed"]["y"], np.delete(SINE[::5], 3))
+    chosen = plot_states(tree, observables={"position": "y"}, backend="none")
+    assert drawn(chosen, "data")["speed"] is None

@@ -1,11 +1,15 @@
 """What comes of any model and any draws: groups, names, choices, warnings, refusals."""
 
+import json
+
 import numpy as np
 import pymc as pm
+import pytensor.tensor as pt
 import pytest
 import xarray as xr
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.pymc_model.observation_moments import sensors_of_states
 from tests.states.models import (
     EKF,
     FORCE,
@@ -61,6 +65,8 @@ def two_systems():
 def test_several_variables_share_a_group_and_what_they_have_in_common():
     group = pair_group(posterior(a=A, b=B), two_systems())
     assert_exact(group, laws_of(law_of_pair, A, B), "d")
+    sensors = json.loads(group["d_states"].attrs["observables"])
+    assert sensors == {"x0": "position", "x1": "speed"}
     assert_exact(group, laws_of(lambda a: pushed_law("filtered", STEPS, a), B), "e")
     assert_exact(group, laws_of(law_of_pair, B, A), "f")
     assert group["d_mean"].dims == ("chain", "draw", "d_time", "state")
@@ -254,3 +260,33 @@ def test_rows_are_at_observations_or_steps(at):
             psf.errors.ModelError, match=r"at must be one of \['observations', 'steps'\]"
         ):
             call(GOOD, pair_model(), at=at)
+
+
+SENSORS = {
+    "another name": (lambda x: [x[1]], {"speed": "y0"}),
+    "matrix": (lambda x: np.array([[1.0, 0.0]]) @ x, {"place": "y0"}),
+    "noise of its own": (lambda x, e: [x[0] + e[0]], {"place": "y0"}),
+    "all, in turn": (lambda x: [x[1], x[0]], {"speed": "y0", "place": "y1"}),
+    "two of one state": (lambda x: [x[0], x[0]], {"place": "y0"}),
+    "sum": (lambda x: [x[0] + x[1]], {}),
+    "unknown gain": (lambda x, a: [a * x[0]], {}),
+    "function": (lambda x: [pt.exp(x[0])], {}),
+    "trend": (lambda x, t: [x[0] + t], {}),
+}
+
+
+@pytest.mark.parametrize("case", SENSORS)
+def test_observables_that_are_a_state(case):
+    observation, expected = SENSORS[case]
+    p = len(expected) if case == "all, in turn" else 1 + (case == "two of one state")
+    system = psf.StateSpaceModel(
+        transition=lambda x, q, a: [a * x[0] + x[1], x[1] + q[0]],
+        process_noise=[[1.0]],
+        observation=observation,
+        observation_noise=np.eye(p),
+        initial_mean=[0.0, 0.0],
+        initial_cov=np.eye(2),
+        states=["place", "speed"],
+        observables=[f"y{i}" for i in range(p)],
+    )
+    assert sensors_of_states(system) == expected
