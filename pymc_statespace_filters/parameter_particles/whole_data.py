@@ -44,8 +44,7 @@ class WholeLikelihood:
 
     def evaluate(self, x: Array, rng: np.random.Generator) -> Particles:
         """Particles at points, a noisy likelihood estimated with fresh noise at each of them."""
-        density = self.factors.density
-        seeds = rng.integers(np.iinfo(np.int64).max, size=(len(x), len(density.seed_names)))
+        seeds = self.factors.seeds(len(x), rng)
         log_prior, log_likelihood = self.factors.evaluate_with(x, seeds)
         none = np.empty((len(x), 0))
         return Particles(x, log_prior, np.zeros(len(x)), log_likelihood, seeds, none)

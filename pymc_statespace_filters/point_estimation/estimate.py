@@ -78,8 +78,8 @@ class MaximumLikelihoodEstimate:
         Why a scalar of a free variable has no standard error, by its label.
     simulation_errors : dict of str to ndarray
         Standard deviations by which the noise of the likelihood displaces `estimate`; 0 if it is
-        deterministic, NaN for the scalars in `reasons` otherwise. `standard_errors` do not include
-        them.
+        deterministic. Otherwise NaN for the scalars in `reasons`, and for all where the notes say
+        that the maximum may not have been found. `standard_errors` do not include them.
     covariance : pandas.DataFrame
         Covariance of the estimate in the model's units, by the labels of all scalars, variable
         after variable, flattened in C order. Its diagonal are the squares of `standard_errors`.

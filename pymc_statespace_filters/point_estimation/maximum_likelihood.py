@@ -26,6 +26,7 @@ from .estimate import (
     EDGE,
     HIDDEN,
     INCREASING,
+    LEVEL,
     STEPPED,
     MaximumLikelihoodEstimate,
     Peak,
@@ -257,7 +258,8 @@ def errors_of(
 ) -> Errors:
     """Errors of the free variables, whose ``values`` are a function of the unconstrained vector."""
     jacobian = _jacobian(lambda x: flattened(values(x)), peak.point, STEP * population.std(axis=0))
-    spread = np.std([flattened(values(x)) for x in population], axis=0)
+    visited = np.array([flattened(values(x)) for x in population])
+    here, spread = flattened(values(peak.point)), visited.std(axis=0)
     along = jacobian @ peak.basis
     covariance = along @ along.T
     directions = np.array([lost.direction for lost in peak.lost]).reshape(-1, len(peak.point))
@@ -270,6 +272,8 @@ def errors_of(
         names = [labels[j] for j in np.flatnonzero(involved[:, which])]
         small = moves[i, which] < AT_BOUND * spread[i]
         reasons[labels[i]] = _reason(peak.lost[which].kind, names, at_bound=bool(small))
+        if peak.lost[which].kind == LEVEL and len(names) == 1 and not small:
+            reasons[labels[i]] = _reason_of_level(labels[i], float(here[i]), visited[:, i])
         if peak.lost[which].kind == STEPPED:
             ends = [float(flattened(values(x))[i]) for x in peak.lost[which].interval]
             reasons[labels[i]] = _reason_of_steps(ends)
@@ -320,6 +324,20 @@ def _reason(kind: str, names: list[str], *, at_bound: bool) -> str:
     if kind == INCREASING:
         return f"not a maximum: the Hessian is not negative definite {direction}"
     return f"not identified: the likelihood is level {direction}"
+
+
+def _reason_of_level(label: str, value: float, visited: Array) -> str:
+    """Why one scalar has none along which the likelihood is level, given those of the population.
+
+    The search leaves the population only where the likelihood rises.
+    """
+    if visited.min() <= value <= visited.max():
+        return _reason(LEVEL, [label], at_bound=False)
+    moves = "grows" if value > visited.max() else "falls"
+    return (
+        f"the likelihood levels off as {label} {moves}, without a maximum: its limit fits the data "
+        "best"
+    )
 
 
 def _reason_of_steps(ends: list[float]) -> str:

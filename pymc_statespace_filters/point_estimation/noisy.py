@@ -8,6 +8,7 @@ the error of the maximum that is due to the noise (Ionides and others 2017). Pur
 fit keep the skewness of the likelihood out of the slope.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -186,27 +187,16 @@ def _peak(function: BatchFunction, surface: _Surface, spread: Array) -> Peak:
     hidden = hidden / np.linalg.norm(np.linalg.solve(spread, hidden), axis=0)
     lost = tuple(Lost(direction, HIDDEN) for direction in hidden.T)
     cov = surface.maximum_cov(z)
-    in_errors = np.einsum("ki,kl,li->i", directions, cov, directions)[kept] * curvature[kept]
-    notes = [
-        f"the likelihood is estimated: the point is the maximum of a quadratic fitted to "
-        f"{surface.n_estimates} estimates, and their noise displaces it by up to "
-        f"{np.sqrt(in_errors.max(initial=0.0)):.2g} standard errors"
-    ]
-    if lost:
-        notes.append(
-            "the maximum was not found: the noise of the likelihood hides its curvature along "
-            f"{len(lost)} of {len(z)} directions, so that the log-likelihood is that of the best "
-            "point found; take more particles (see suggest_particles)"
-        )
-    if distance > NEAR:
-        notes.append(
-            f"the search did not converge: its last step was {distance:.2g} standard errors long"
-        )
-    if value.error > TOO_NOISY:
-        notes.append(
-            "the likelihood is so noisy that the errors are too small: take more particles (see "
-            "suggest_particles)"
-        )
+    notes = list(_doubts(len(lost), len(z), distance, value.error))
+    if notes:  # the errors of a maximum do not hold elsewhere
+        cov[:] = np.nan
+    else:
+        in_errors = np.einsum("ki,kl,li->i", directions, cov, directions) * curvature
+        notes = [
+            f"the likelihood is estimated: the point is the maximum of a quadratic fitted to "
+            f"{surface.n_estimates} estimates, and their noise displaces it by up to "
+            f"{np.sqrt(in_errors.max()):.2g} standard errors"
+        ]
     return Peak(
         point,
         value.value,
@@ -217,6 +207,23 @@ def _peak(function: BatchFunction, surface: _Surface, spread: Array) -> Peak:
         scale @ cov @ scale.T,
         tuple(notes),
     )
+
+
+def _doubts(n_lost: int, k: int, distance: float, value_error: float) -> Iterator[str]:
+    """Why the point may not be the maximum."""
+    if n_lost:
+        yield (
+            "the maximum was not found: the noise of the likelihood hides its curvature along "
+            f"{n_lost} of {k} directions, so that the log-likelihood is that of the best point "
+            "found; take more particles (see suggest_particles)"
+        )
+    elif distance > NEAR:
+        yield f"the search did not converge: its last step was {distance:.2g} standard errors long"
+    if value_error > TOO_NOISY:
+        yield (
+            "the likelihood is so noisy that the standard errors are too small: take more "
+            "particles (see suggest_particles)"
+        )
 
 
 def _unfitted(function: BatchFunction, point: Array, scale: Array) -> Peak:

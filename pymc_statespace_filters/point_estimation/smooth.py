@@ -27,7 +27,10 @@ SETTLED = 1e-6  # standard errors, of a Newton step
 RESCALING = 0.01, 1e4  # least and most curvature that a rescaling trusts
 MAX_LENGTH = 3.0  # of a scale, in standard deviations of the population
 MIN_CURVATURE = 0.3  # below, a direction is probed
-PROBES, MIN_FALL = (1.0, 2.0, 4.0), 0.01  # distances in scales; nats
+PROBES, MIN_FALL = (0.5, 1.0, 2.0, 4.0), 0.01  # distances in scales; nats
+# Points a tiny move from a probe, whose values tell its rounding errors; nats that do not matter;
+# a gain that is trusted, in rounding errors.
+N_TWINS, TWIN, ROUNDING, TRUSTED = 4, 1e-10, 1e-9, 100.0
 N_MOVES, MIN_GAIN = 5, 1e-10  # most moves towards a bound; nats, of a move that is worth it
 MAX_DECREMENT = 0.01  # standard errors, of the Newton step that remains
 RIVAL_NATS, RIVAL_DISTANCE = 2.0, 5.0  # below the maximum; standard errors from it
@@ -224,7 +227,7 @@ def _without_curvature(
     for i in np.flatnonzero(curvature < MIN_CURVATURE):
         direction = local.scale @ directions[:, i]
         probes = local.point + np.multiply.outer((*PROBES, *(-t for t in PROBES)), direction)
-        gains = function(probes) - local.value
+        gains = _trusted_gains(function, local, probes.reshape(2, len(PROBES), -1)).ravel()
         level = (gains > -MIN_FALL).reshape(2, -1).all(axis=1).any()
         if gains.max() > MIN_FALL or curvature[i] <= -MIN_CURVATURE:
             lost[int(i)] = Lost(direction, INCREASING)
@@ -233,6 +236,19 @@ def _without_curvature(
         if gains.max() > gain:
             best, gain = probes[gains.argmax()], float(gains.max())
     return lost, best, gain
+
+
+def _trusted_gains(function: BatchFunction, local: _Local, probes: Array) -> Array:
+    """Gains (2, m) at probes (2, m, k) on two rays; 0 from where rounding errors are as large.
+
+    Far out a likelihood may lose its digits: that of counts, whose overdispersion vanishes.
+    """
+    twins = probes[..., None, :] + TWIN * np.multiply.outer(range(N_TWINS), local.scale.sum(axis=1))
+    values = function(twins.reshape(-1, len(local.point))).reshape(twins.shape[:-1])
+    gains = values[..., 0] - local.value
+    rounding = np.ptp(values, axis=-1)
+    is_blurred = (rounding > ROUNDING) & (np.abs(gains) < TRUSTED * rounding)
+    return np.where(np.logical_or.accumulate(is_blurred, axis=1), 0.0, gains)
 
 
 def _doubts(local: _Local, curvature: Array, directions: Array) -> list[str]:

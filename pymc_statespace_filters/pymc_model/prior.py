@@ -16,7 +16,7 @@ from pytensor.tensor.random.basic import UniformRV
 from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
-from .density import ModelDensity, RowFunction
+from .density import RowFunction, check_free_variables
 from .prior_draws import PriorDraws
 
 _IMPROPER = (FlatRV, HalfFlatRV, ICARRV)  # PyMC's densities without a finite integral
@@ -189,34 +189,42 @@ class ModelFactors:
     """Log prior and log-likelihood of a model on its unconstrained space.
 
     The likelihood is everything in the model except the priors of the free variables, Potentials
-    included: the log-density minus the log prior. The Jacobians of the transforms belong to the
-    prior.
+    included. It is evaluated by itself: far out in a prior, its difference from the log-density has
+    no digits. The Jacobians of the transforms belong to the prior.
 
     Attributes
     ----------
-    density : ModelDensity
+    likelihood : RowFunction
     prior : ModelPrior
     """
 
     def __init__(self, model: pm.Model) -> None:
-        self.density, self.prior = ModelDensity(model), ModelPrior(model)
+        check_free_variables(model)
+        self.prior = ModelPrior(model)
+        self.likelihood = RowFunction(
+            model, model.logp(vars=[*model.observed_RVs, *model.potentials])
+        )
 
     @property
     def is_noisy(self) -> bool:
         """Whether the likelihood is a random estimate."""
-        return bool(self.density.seed_names)
+        return bool(self.likelihood.seed_names)
 
     def evaluate(self, x: Array, rng: np.random.Generator) -> tuple[Array, Array]:
         """Log prior and log-likelihood of points x (m, k), each (m,); -inf instead of NaN.
 
         A noisy likelihood is estimated with fresh noise at every point.
         """
-        seeds = rng.integers(np.iinfo(np.int64).max, size=(len(x), len(self.density.seed_names)))
-        return self.evaluate_with(x, seeds)
+        return self.evaluate_with(x, self.seeds(len(x), rng))
+
+    def seeds(self, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Fresh seeds of the noise, a row for each point."""
+        size = count, len(self.likelihood.seed_names)
+        return rng.integers(np.iinfo(np.int64).max, size=size)
 
     def evaluate_with(self, x: Array, seeds: NDArray[np.int64]) -> tuple[Array, Array]:
         """The same with the noise of these seeds, a row for each point."""
         log_prior = self.prior.log_density(x)
-        with np.errstate(invalid="ignore"):
-            log_likelihood = self.density.evaluate(x, seeds) - log_prior
-        return log_prior, np.where(np.isfinite(log_likelihood), log_likelihood, -np.inf)
+        log_likelihood = self.likelihood.evaluate(x, seeds)
+        inside = np.isfinite(log_prior) & np.isfinite(log_likelihood)
+        return log_prior, np.where(inside, log_likelihood, -np.inf)

@@ -7,6 +7,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.jumps import stepped_parameters
+from pymc_statespace_filters.pymc_model.inspection import state_space_nodes
 from pymc_statespace_filters.pymc_model.stepped import stepped_variables
 
 pytestmark = pytest.mark.usefixtures("interpreted")
@@ -34,6 +35,10 @@ CASES = {
         lambda x, q, a, tau: a * x[0] + pt.switch(pt.abs(tau) < 1e-8, 1.0, pt.expm1(tau) / tau),
         (),
     ),
+    "guard with rounding": (
+        lambda x, q, w: pt.switch(w > 1e-8, (1 - pt.cos(w)) / w**2, 0.5) * x[0] + q[0],
+        (),
+    ),
 }
 
 
@@ -41,6 +46,22 @@ CASES = {
 def test_parameters_compared_with_the_time_are_found(case):
     transition, expected = CASES[case]
     assert stepped_parameters(system(transition)) == expected
+
+
+def test_a_condition_inside_a_matrix_exponential_is_no_staircase():
+    """The root of the covariance of a step at uneven times has one."""
+    equation = psf.ExactLinear(
+        lambda w2, c: [[0.0, 1.0], [-w2, -c]], lambda s: [[0.0], [s]], dt=1.0
+    )
+    oscillator = psf.StateSpaceModel(
+        transition=equation, observation=lambda x: x[0], observation_noise=0.1,
+        initial_mean=[0.0, 0.0], initial_cov=0.1 * np.eye(2),
+    )  # fmt: skip
+    with pm.Model() as model:
+        for name in ("w2", "c", "s"):
+            pm.HalfNormal(name)
+        psf.StateSpace("d", oscillator, psf.EKF(), times=[0.1, 0.5, 1.1], observed=np.zeros(3))
+    assert stepped_parameters(state_space_nodes(model)["d"].op.system) == ()
 
 
 def model_of(tau, observed=None):

@@ -31,6 +31,8 @@ STEPPED = (
     ps.Sign, ps.Floor, ps.Ceil, ps.Trunc, ps.RoundHalfToEven, ps.RoundHalfAwayFromZero, ps.Mod,
     ps.IntDiv, ps.LT, ps.GT, ps.LE, ps.GE, ps.EQ, ps.NEQ,
 )  # fmt: skip
+_ROUNDED = STEPPED[:8]  # which have many steps of one argument
+_MOST_OF_A_CONDITION = 20  # operations; a longer one guards an algorithm, as a matrix's root
 _MOST_EVALUATIONS = 40_000  # of scalar operations, on all lines together
 _N_LINES = 6
 _MOST_PLACES = 12  # on a line, those nearest to its middle
@@ -107,9 +109,16 @@ def stepped_parameters(system: StateSpaceModel) -> tuple[str, ...]:
     """Parameters of which every likelihood is a staircase; none where that is undecided."""
     elements = _moments(system.gaussian)
     everything = _under(elements)
-    inputs = {e.args[0] for e in everything if e.op is None}
+    inputs = frozenset(e.args[0] for e in everything if e.op is None)
     moving = frozenset(name for name in inputs if name.split(".")[0] in ("x", "q", "e"))
-    stepped = {e for e in everything if isinstance(e.op, STEPPED)} - depends_on(elements, moving)
+    theta = frozenset(name for name in inputs if name.startswith("theta."))
+    timed = depends_on(elements, inputs - moving - theta)
+    stepped = {
+        e
+        for e in everything - depends_on(elements, moving)
+        if isinstance(e.op, _ROUNDED) or (isinstance(e.op, STEPPED) and e in timed)
+        if len(_under([e])) <= _MOST_OF_A_CONDITION
+    }
     scalars = np.repeat(system.parameters, [math.prod(s) for s in system.parameter_shapes])
     found = [
         name
