@@ -158,11 +158,12 @@ class GuidedPF(ParticleFilter):
     tenths, moves unguided; no weight of such an interval is above the inverse of the share. The
     share is larger where 128 unguided particles, which run along the record first, find paths that
     explain it as well as the guide does and that guided particles would miss: the other sign behind
-    a sensor of ``abs(x)``, the other side of a threshold. They have noise of their own, which is
-    always the same, and nothing else of them enters the estimate. A system that is linear is spared
-    them. On records with two explanations the filter is then about as good as a `BootstrapPF` of as
-    many particles, but no better: what 128 unguided particles do not find, such as a narrow way
-    under a precise sensor, can still be missed.
+    a sensor of ``abs(x)``, the other side of a threshold. It is nine tenths everywhere if the
+    sensor folds between these particles. They have noise of their own, which is always the same,
+    and nothing else of them enters the estimate. A system that is linear is spared them. On records
+    with two explanations the filter is then about as good as a `BootstrapPF` of as many particles,
+    but no better, and slower: use that one where a sensor folds. What 128 unguided particles do not
+    find, such as a narrow way under a precise sensor, can still be missed.
 
     Terms of single observations are noisier than their sum, because particles are where the whole
     record wants them.

@@ -16,6 +16,12 @@ A path that is rare and good is missed; one that is only rare lags behind a surp
 saw coming. The share of particles that the filter leaves unguided in the interval is the one of
 least variance of the weights, if the smoothed state is distributed as these paths.
 
+Where the sensor folds, two explanations may last for the whole record, and the pilot, whose
+particles are resampled, may lose one of them within a few observations. So it asks another question
+of pairs of its particles: does a state halfway between them explain the observation far worse than
+either? It does not if the sensor is monotone. If it does for several pairs, the guide is trusted
+nowhere: the largest share holds in all intervals.
+
 The pilot has noise of its own, which depends on nothing: the guide remains a function of the record
 and the parameters, the same on every rank and for stored normals. Nothing else of it is used: an
 estimate that looked at the pilot's would not be unbiased.
@@ -31,6 +37,7 @@ from ...compiler.numerics.exponential import exp
 from ...compiler.numerics.normals import BLOCK
 from ...compiler.numerics.philox import PILOT
 from ..outcomes import is_missing
+from ..plan import log_density
 from .defence import LEAST_SHARE
 from .guided_moves import begin_interval, guided_particles, log_psi, move, start
 from .loop import n_sums
@@ -43,6 +50,8 @@ _LAG = 4  # observations until the descendants of a path count
 _LENGTH = _LAG + 1
 _SHARES = (0.0, LEAST_SHARE, 0.3, 0.5, 0.7, 0.9)
 _ENOUGH, _LOG_ENOUGH = 1.2, 0.18  # times the least variance
+_VALLEY = 2.0  # nats by which the sensor must be worse halfway between two particles
+_FOLDED = 4  # pairs, of N / 2, between which the sensor folds, and not by the chance of a tail
 _SEED = 0
 
 
@@ -103,6 +112,10 @@ def judge(system, record, guide, update, shares):
         _record_moves(paths, seen, before, particles, found.increment, guide.sums[first, 1])
         paths.rows[seen % _LENGTH] = first
         resample(resampling, resampling_normals(noise, j, k), members.w, members.X, local)
+        if _folds(system, k, t, d, members, resampling.ancestors):
+            for i in range(steps.size):
+                shares[i] = _SHARES[-1]
+            return
         _follow_lineage(paths, seen, resampling.ancestors)
         for i in range(_N):
             before[i] = particles.log_v[resampling.ancestors[i]]
@@ -114,6 +127,21 @@ def judge(system, record, guide, update, shares):
     for back in range(_LAG):
         if back < seen:
             shares[paths.rows[(seen - 1 - back) % _LENGTH]] = _share(paths, seen, np.int64(back))
+
+
+@njit_internal
+def _folds(system, k, t, d, members, ancestors):
+    """Whether the sensor folds between resampled particles."""
+    X, half, n_folds = members.X, _N // 2, 0
+    between, log_p = np.empty(X.shape), np.empty(_N)
+    for a in range(X.shape[0]):
+        for i in range(_N):
+            between[a, i] = 0.5 * (X[a, i] + X[a, (i + half) % _N])
+    log_density(system, k, t, d, between, log_p)
+    for i in range(half):
+        worse = min(members.log_p[ancestors[i]], members.log_p[ancestors[i + half]])
+        n_folds += log_p[i] < worse - _VALLEY
+    return n_folds >= _FOLDED
 
 
 @njit_internal
