@@ -1,19 +1,22 @@
 """Sequential log-likelihood terms at every draw, each with the noise of its own estimate."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pymc as pm
 import xarray as xr
+from numpy.typing import NDArray
 
 from ..errors import ModelError
+from ..filters.protocol import properties
 from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.sequential_terms import warn_of_sequence
 from ..pymc_model.state_space_variable import StateSpaceVariable, terms_of
 from ..states.draws import PosteriorDraws, select_draws
 from ..states.groups import add_group, coords_of_steps
-from ..states.record import Array
+from ..states.record import Array, RecordAtDraws
 from ..states.variable import VariableAtDraws, select_variables
 
 SEQUENTIAL = (
@@ -54,7 +57,9 @@ def compute_log_likelihood(
     The likelihood by a particle or ensemble filter is an estimate that depends on a noise seed.
     `sample_dram` stores the seed of each draw, and with it the terms add up to the estimate by
     which the draw was accepted. (``pm.compute_log_likelihood`` uses the seed held by the model for
-    all draws, and so gives other estimates.)
+    all draws, and so gives other estimates.) A `GuidedPF` places its particles for the whole
+    record. Its terms are differences of the log-likelihoods of records that end with each row,
+    which takes half as many times longer as there are rows.
 
     Parameters
     ----------
@@ -173,7 +178,29 @@ def _terms(at_draws: VariableAtDraws, progressbar: bool) -> list[Array]:
     found = []
     with at_draws.progress(f"terms of {variable.name}", enabled=progressbar):
         for record in at_draws.records:
-            (terms,) = record.evaluate(terms_of(variable), {"seed": record.noise_of(seeds)})
+            noise = record.noise_of(seeds)
+            looks_ahead = properties(variable.filter).needs_record_ahead
+            apart = looks_ahead and not variable.is_panel
+            terms = _increments(record, noise) if apart else _terms_at_once(record, noise)
             terms[:, : variable.score_from] = 0.0
             found.append(terms)
     return found
+
+
+def _terms_at_once(record: RecordAtDraws, noise: NDArray[np.int64]) -> Array:
+    (terms,) = record.evaluate(terms_of(record.variable), {"seed": noise})
+    return terms
+
+
+def _increments(record: RecordAtDraws, noise: NDArray[np.int64]) -> Array:
+    """By how much each row adds to the log-likelihood of the rows until then.
+
+    The terms of a filter that looks ahead are of particles placed for the whole record.
+    """
+    totals = np.empty((len(noise), len(record.steps)))
+    for j in range(len(record.steps)):
+        until = replace(record, steps=record.steps[: j + 1], observed=record.observed[: j + 1])
+        totals[:, j] = _terms_at_once(until, noise).sum(axis=1)
+    with np.errstate(invalid="ignore"):
+        terms = np.diff(totals, prepend=0.0)
+    return np.where(np.isneginf(totals), -np.inf, terms)

@@ -143,11 +143,11 @@ def _witnesses(variable: VariableAtPoints, filter: Filter, budget: Budget) -> li
     """A filter without noise or bias that is quick; else unbiased ones, and it if there is time."""
     exact = exact_filter(compile_system(variable.system), without=filter)
     if exact is None or not np.isfinite(variable.at([0], exact, _ONE_SEED)).all():
-        return _unbiased(variable, filter, budget)
+        return unbiased_witnesses(variable, filter, budget)
     seconds = _seconds(variable, exact)
     if seconds <= _QUICK:
         return [exact]
-    found = _unbiased(variable, filter, budget)
+    found = unbiased_witnesses(variable, filter, budget)
     return [exact, *found] if budget.is_enough_for(seconds * len(variable)) else found
 
 
@@ -163,7 +163,7 @@ def is_unbiased(filter: Filter) -> bool:
     return filter.noisy and bool(getattr(filter, "unbiased", False))
 
 
-def _unbiased(variable: VariableAtPoints, filter: Filter, budget: Budget) -> list[Filter]:
+def unbiased_witnesses(variable: VariableAtPoints, filter: Filter, budget: Budget) -> list[Filter]:
     """Plain particles, and guided ones if there is time and no equation jumps, which misleads them.
 
     Of a guided filter, the same with more particles. Plain are those with Kalman filters where they
@@ -181,6 +181,8 @@ def _unbiased(variable: VariableAtPoints, filter: Filter, budget: Budget) -> lis
         plain = regimes
     found: list[Filter] = [resized(one, n_particles) for one in plain]
     guided = [one for one in taken if isinstance(one, GuidedPF) and not system.jumping_equations]
+    if variable.leaves_rows_out and not is_unbiased(filter):
+        guided = []  # of a part of a record its estimate is wrong
     if isinstance(filter, GuidedPF):
         guided = [replace(filter, n_particles=_MORE * filter.n_particles)]
     n_estimates = N_GUIDED_SEEDS * n_points

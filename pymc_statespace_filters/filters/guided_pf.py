@@ -165,8 +165,11 @@ class GuidedPF(ParticleFilter):
     but no better, and slower: use that one where a sensor folds. What 128 unguided particles do not
     find, such as a narrow way under a precise sensor, can still be missed.
 
-    Terms of single observations are noisier than their sum, because particles are where the whole
-    record wants them.
+    Particles are where the whole record wants them, so that a part of its terms is no estimate of
+    those rows: a start of which nothing is known makes the first terms too low and the others too
+    high. `compute_log_likelihood` and `leave_future_out` take differences of estimates of shorter
+    records, ``score_from`` is refused. Filtered states and predictions of observations are too
+    narrow where later rows say far more about the state; smoothed states are not.
 
     A particle with a non-finite state has weight zero.
 

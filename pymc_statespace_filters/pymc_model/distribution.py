@@ -11,10 +11,11 @@ from pymc.distributions.distribution import Continuous
 from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
+from ..compiler.lowering.compiled_system import compile_system
 from ..errors import ModelError
 from ..evaluation.filter_warnings import warn_of_choice
-from ..filters.protocol import Filter
-from ..filters.recommendation import check_system_and_filter
+from ..filters.protocol import Filter, properties
+from ..filters.recommendation import alternatives, check_system_and_filter, short_form
 from ..system.checks import is_integer
 from ..system.clock import Clock
 from ..system.given_record import GivenRecord
@@ -98,7 +99,8 @@ class StateSpace(Continuous):
         The first row of the data, or of each record, whose term counts, 0 for all. The filter
         passes through the rows before it, which settle a state whose start is not known; their
         terms are 0 in the log-density and in `compute_log_likelihood`, and they do not count as
-        observations in the evidence. Models are comparable only with the same number.
+        observations in the evidence. Models are comparable only with the same number. `GuidedPF`,
+        which places its particles for the whole record, takes 0 alone.
     dims : (str, str), optional
         Names of the dimensions, default ``({name}_time, observable)``; of a panel
         ``({name}_obs, observable)``. A panel also adds the dimension ``{name}_record``, whose
@@ -212,7 +214,7 @@ class StateSpace(Continuous):
             noise_seed,
             system=record.system,
             filter=filter,
-            score_from=_check_score_from(score_from, n_rows),
+            score_from=_check_score_from(score_from, n_rows, system, filter),
             clock=record.clock,
             timed=record.timed,
             observed=record.observed,
@@ -287,11 +289,19 @@ def _check_name(model: pm.Model, full_name: str, name: str, system: StateSpaceMo
         )
 
 
-def _check_score_from(score_from: Any, n_observations: int) -> int:
+def _check_score_from(
+    score_from: Any, n_observations: int, system: StateSpaceModel, filter: Filter
+) -> int:
     if not is_integer(score_from) or not 0 <= score_from < n_observations:
         raise ModelError(
             f"score_from must be an integer from 0 to {n_observations - 1}, as there are "
             f"{n_observations} observations, got {score_from!r}"
+        )
+    if score_from and properties(filter).needs_record_ahead:
+        raise ModelError(
+            f"score_from must be 0 with {short_form(filter)}, which places its particles for the "
+            f"whole record and misjudges a part of it, got {score_from}; "
+            f"{alternatives(compile_system(system), filter)}"
         )
     return int(score_from)
 

@@ -78,6 +78,11 @@ class VariableAtPoints:
         return len(self._arguments)
 
     @property
+    def leaves_rows_out(self) -> bool:
+        """Whether the log-density has no term of some rows."""
+        return self._scored is not ...
+
+    @property
     def n_steps(self) -> int:
         """Steps of one evaluation, of all records."""
         op = LogLikelihood(self.system, self.filter, self._form)
