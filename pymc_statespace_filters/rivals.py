@@ -3,18 +3,22 @@
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import fields
+from functools import partial
 from inspect import signature
 from pathlib import Path
 from typing import Any, Literal, overload
 
 import numpy as np
 from pymc.model import Model
+from pymc.stats.convergence import log_warnings
 from xarray import DataTree
 
 from .errors import ModelError
 from .former_names import former_names
+from .parallel.signals import keeps_what_is_there, unless_interrupted
 from .parameter_particles import sample_smc
 from .sampling.checkpoint.checkpoint import checked_folder, folder_name
+from .sampling.output.report import no_draws_warning
 from .sampling.run.driver import sample_models
 from .sampling.run.request import RunArguments
 from .sampling.run.warm_start import warm_started_models
@@ -39,6 +43,7 @@ def run_models(
 
 
 @former_names(**FORMER_ARGUMENTS)
+@keeps_what_is_there
 def run_models(
     models: Mapping[str, Model],
     *,
@@ -77,8 +82,8 @@ def run_models(
     Returns
     -------
     dict of str to xarray.DataTree
-        As returned by the sampler; None on ranks that do not get them. After Ctrl-C in "dram",
-        those of the models that have draws; a warning names the others.
+        As returned by the sampler; None on ranks that do not get them. After Ctrl-C those of the
+        models that have draws; a warning names the others.
 
     Raises
     ------
@@ -144,7 +149,8 @@ def _particles(
 ) -> dict[str, DataTree] | None:
     """Every model by `sample_smc`, with the same seed; None on ranks that do not get them."""
     seed, found = settings.get("random_seed"), {}
-    for name, model in models.items():
+
+    def add(name: str, model: Model) -> None:
         # Each gets the numbers that a generator would give the first.
         own = deepcopy(seed) if isinstance(seed, np.random.Generator) else seed
         try:
@@ -155,4 +161,9 @@ def _particles(
             raise
         if tree is not None:
             found[name] = tree
+
+    for name, model in models.items():
+        unless_interrupted(partial(add, name, model), None)
+    if found:
+        log_warnings([no_draws_warning(name) for name in models if name not in found])
     return found or None

@@ -3,11 +3,13 @@
 import gc
 import os
 import signal
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
 from tests.costs import Costs
+from tests.waiting import limited
 
 # One BLAS thread: the matrices are small, and the test processes already fill the cores.
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -71,6 +73,13 @@ def pytest_collection_modifyitems(items):
     tests = Path(__file__).parent
     order = {tests / name: number for number, name in enumerate(LONGEST)}
     items.sort(key=lambda item: order.get(item.path, len(LONGEST)))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item):
+    """A test that hangs fails, with its fixtures; calibrations take as long as they take."""
+    with nullcontext() if item.get_closest_marker("slow") else limited():
+        return (yield)
 
 
 @pytest.fixture(scope="module")

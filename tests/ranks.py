@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from pymc_statespace_filters.parallel.communicator import Communicator, Message
+from tests.waiting import LIMIT
 
 _EXCHANGE = ctypes.CFUNCTYPE(
     None, ctypes.POINTER(ctypes.c_double), ctypes.c_ssize_t, ctypes.c_ssize_t, ctypes.c_ssize_t
@@ -81,7 +82,7 @@ def _part(rank: int, size: int, columns: int, per_block: int) -> slice:
 
 def on_ranks(size: int, call: Callable[[FakeRank], Any]) -> list:
     """Results of ``call(rank)`` of every rank, all at once; the first error, if there is one."""
-    table, barrier, errors = [None] * size, Barrier(size, timeout=60), []
+    table, barrier, errors = [None] * size, Barrier(size, timeout=LIMIT), []
     letters = [SimpleQueue() for _ in range(size)]
     ranks = [FakeRank(rank, size, table, barrier, letters) for rank in range(size)]
 

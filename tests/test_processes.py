@@ -72,9 +72,9 @@ def test_a_compiled_model_gives_the_same_bits_in_a_child(method, densities, dram
     with ProcessPoolExecutor(1, mp_context=context) as pool:
         calls = [pool.submit(evaluate, cloudpickle.dumps(logp), POINT) for logp in densities]
         chain = pool.submit(chain_of, cloudpickle.dumps(dram))
-        there = [call.result(timeout=120) for call in calls]
+        there = [call.result(timeout=LIMIT) for call in calls]
     here = chain_of(cloudpickle.dumps(dram))
-    assert chain.result() == here
+    assert chain.result(timeout=LIMIT) == here
     assert len(set(here)) > 3
     assert there == [logp(POINT) for logp in densities]
 

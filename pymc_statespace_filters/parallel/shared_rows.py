@@ -8,7 +8,7 @@ a number of evaluations that fits a budget, is decided by the first rank alone.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from contextvars import ContextVar
 from itertools import pairwise
 from threading import Event
@@ -18,7 +18,7 @@ from zlib import crc32
 import numpy as np
 
 from .communicator import Communicator
-from .signals import deferred_interrupts
+from .signals import deferred_interrupts, unless_interrupted
 
 _MARKED = 4096  # elements of an array that enter the mark of a step
 
@@ -47,17 +47,14 @@ def rows_shared_by(comm: Communicator) -> Iterator[None]:
             _ranks.reset(token)
 
 
-@contextmanager
-def outlasting_interrupts() -> Iterator[None]:
-    """Let an interrupt end the block, and not what comes after it.
-
-    Ranks, of which one alone may be interrupted, evaluate the block to its end.
-    """
+def outlasting_interrupts[R](work: Callable[[], R], otherwise: R) -> R:
+    """As `unless_interrupted`; ranks, of which one alone may be interrupted, do all of the work."""
     ranks = _ranks.get()
-    token = _ranks.set(None if ranks is None else ranks._replace(interrupted=Event()))
+    if ranks is None:
+        return unless_interrupted(work, otherwise)
+    token = _ranks.set(ranks._replace(interrupted=Event()))
     try:
-        with suppress(KeyboardInterrupt):
-            yield
+        return work()
     finally:
         _ranks.reset(token)
 

@@ -1,10 +1,123 @@
-"""Handling of Ctrl-C where an exception could be lost, or leave ranks waiting for each other."""
+"""Handling of Ctrl-C where an exception could be lost, or leave ranks waiting for each other.
+
+A call that has something to return, such as draws, does not lose it by an interrupt: see
+`keeps_what_is_there`.
+"""
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import wraps
 from threading import Event, current_thread, main_thread
 from typing import Any
+
+
+class _Call:
+    """A call that may be interrupted, and returns what it has as soon as there is something."""
+
+    def __init__(self, outer: "_Call | None") -> None:
+        self._outer, self._before = outer, signal.getsignal(signal.SIGINT)
+        self._handles = current_thread() is main_thread() and self._before is not None
+        self.has_result = self.may_skip = self.returns = False
+        self.is_interrupted = self.was_interrupted = False  # the first until somebody takes it
+
+    def begin(self) -> None:
+        if self._handles:
+            signal.signal(signal.SIGINT, self._handle)
+        if self._outer is not None and self._outer.is_interrupted:
+            raise KeyboardInterrupt  # between two calls
+
+    def end(self) -> None:
+        """Hand over to the former handler, and to the call that surrounds this one."""
+        outer = self._outer or _Call(None)
+        keeps = self.returns and self.has_result
+        outer.has_result |= keeps
+        if self._handles:
+            try:
+                signal.signal(signal.SIGINT, self._before)
+            except KeyboardInterrupt:  # of the former handler, at once
+                if not keeps:
+                    raise
+        outer.is_interrupted |= keeps and self.was_interrupted
+
+    def _handle(self, *signal_and_frame: Any) -> None:
+        if self.has_result:
+            self.is_interrupted = self.was_interrupted = True
+            if self.may_skip:
+                raise KeyboardInterrupt
+        elif callable(self._before):
+            self._before(*signal_and_frame)
+
+
+_call: ContextVar[_Call | None] = ContextVar("call that keeps what is there", default=None)
+
+
+def keeps_what_is_there[**P, R](function: Callable[P, R]) -> Callable[P, R]:
+    """Let a function return its result in spite of interrupts, however many.
+
+    Until it says by `interrupts_are_noted` that there is something to return, an interrupt raises.
+    From then on it is noted alone, for the function to ask for by `takes_interrupt`, and ends no
+    more than what `unless_interrupted` runs.
+    """
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        own = _Call(_call.get())
+        token = _call.set(own)
+        try:
+            own.begin()
+            result = function(*args, **kwargs)
+            own.returns = True
+        finally:
+            _call.reset(token)
+            own.end()
+        return result
+
+    return call
+
+
+def interrupts_are_noted() -> None:
+    """Say that there is, or will be, something that the function under way is to return."""
+    if (call := _call.get()) is not None:
+        call.has_result = True
+
+
+def is_interrupted() -> bool:
+    """Whether an interrupt was noted, that nothing has taken."""
+    call = _call.get()
+    return call is not None and call.is_interrupted
+
+
+def takes_interrupt() -> bool:
+    """The same, for who acts on it: it ends nothing else."""
+    call, found = _call.get(), is_interrupted()
+    if call is not None and found:
+        call.is_interrupted = False
+    return found
+
+
+def unless_interrupted[R](work: Callable[[], R], otherwise: R) -> R:
+    """The result of work that can be done without, or ``otherwise`` after an interrupt.
+
+    An interrupt ends this work, and all other that comes after it. Where there is nothing else to
+    return it raises.
+    """
+    call = _call.get()
+    if call is None or not call.has_result:
+        return work()
+    try:
+        try:
+            call.may_skip = True
+            return otherwise if call.is_interrupted else work()
+        finally:
+            call.may_skip = False
+    except BaseException as error:  # by machine code it may be another one than was raised there
+        call.may_skip = False
+        call.is_interrupted |= isinstance(error, KeyboardInterrupt)
+        if not call.is_interrupted:
+            raise
+        return otherwise
 
 
 @contextmanager
@@ -15,8 +128,12 @@ def deferred_interrupts() -> Iterator[Event]:
     are never interrupted.
     """
     interrupted = Event()
-    with _handled_by(lambda *_: interrupted.set()):
-        yield interrupted
+    token = _call.set(None)  # interrupts are not noted there
+    try:
+        with _handled_by(lambda *_: interrupted.set()):
+            yield interrupted
+    finally:
+        _call.reset(token)
 
 
 class held_interrupts:

@@ -8,6 +8,7 @@ import xarray as xr
 
 from ..compiler.native.compilation import COMPILATION
 from ..errors import DataMismatchError, ModelError
+from ..parallel.signals import keeps_what_is_there
 from ..pymc_model.filter_rows import Record
 from ..pymc_model.inspection import given_model
 from ..system.checks import check_flag, check_random_seed
@@ -24,6 +25,7 @@ from .stored_run import restored
 from .stored_steps import StoredSteps
 
 
+@keeps_what_is_there
 def extend(
     idata: xr.DataTree,
     model: pm.Model | None = None,

@@ -1,7 +1,6 @@
 """Whether the likelihood of a run is that of its system: the check of its filters at its end."""
 
 from collections.abc import Sequence
-from contextlib import suppress
 
 import pymc as pm
 import xarray as xr
@@ -11,7 +10,8 @@ from ..filter_checks.checks import kept, store
 from ..filter_checks.finding import OFF
 from ..filters.protocol import Filter
 from ..parallel.shared_rows import by_first_rank
-from ..sampling.output.filter_check import check_filters, warn_of_filters
+from ..parallel.signals import unless_interrupted
+from ..sampling.output.filter_check import FilterCheck, check_filters, warn_of_filters
 from .output import DoubtsOf
 from .request import Request
 
@@ -22,18 +22,18 @@ def checked_at_end(model: pm.Model, request: Request, *, progressbar: bool) -> D
     """Filters are compared with unbiased ones at draws of the result, as at the end of chains."""
 
     def doubts_of(tree: xr.DataTree, filter: Filter | None, seconds: float) -> Sequence[str]:
-        n_particles = request.draws * request.n_populations
+        n_particles, rng = request.draws * request.n_populations, request.generator(_CHECK)
 
-        def check() -> Sequence[str]:
-            with suppress(KeyboardInterrupt):
-                rng = request.generator(_CHECK)
-                found = check_filters(tree, model, n_particles, seconds, rng, filter)
-                log_warnings(found.messages("info" if progressbar else "debug"))
-                warn_of_filters(found.warned)
-                return found.warned
-            return ()
+        def check() -> FilterCheck:
+            return check_filters(tree, model, n_particles, seconds, rng, filter)
 
-        return by_first_rank(check)
+        def say() -> Sequence[str]:
+            found = unless_interrupted(check, FilterCheck())
+            log_warnings(found.messages("info" if progressbar else "debug"))
+            warn_of_filters(found.warned)
+            return found.warned
+
+        return by_first_rank(say)
 
     return doubts_of
 

@@ -16,6 +16,7 @@ from ..evidence.posterior import Posterior
 from ..filters.protocol import Filter
 from ..filters.recommendation import short_form
 from ..parallel.shared_rows import by_first_rank, outlasting_interrupts
+from ..parallel.signals import keeps_what_is_there
 from ..progress import stage_progress
 from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.inspection import given_model, is_filter
@@ -35,6 +36,7 @@ from .whole_data import WholeLikelihood, missed_in, tempered_run
 _MAXIMUM = 2**32 + 1  # key of random numbers beside those of the run
 
 
+@keeps_what_is_there
 @shared_by_ranks
 def sample_smc(
     draws: int = 1000,
@@ -251,10 +253,11 @@ def _tempered(
     began, likelihood = perf_counter(), WholeLikelihood(model, screen)
     with stage_progress(1.0, enabled=progressbar) as show:
         run, visited = tempered_run(model, likelihood, request, show, steps, looks=looks)
-        maximum = _maximum(likelihood.factors, run, request)
-        with outlasting_interrupts():
-            run = run._replace(missed=missed_in(run, visited, model, likelihood, request))
-    seconds = perf_counter() - began
+        maximum = outlasting_interrupts(lambda: _maximum(likelihood.factors, run, request), np.nan)
+        missed = outlasting_interrupts(
+            lambda: missed_in(run, visited, model, likelihood, request), None
+        )
+    seconds, run = perf_counter() - began, run._replace(missed=missed)
     observed = observed_in(model)
     return as_datatree(
         model, run, request, observed, data="tempered", seconds=seconds, maximum=maximum,

@@ -5,11 +5,13 @@ from time import perf_counter
 
 import numpy as np
 import xarray as xr
+from pymc.stats.convergence import SamplerWarning, log_warnings
 
 from ..evidence.observed_data import Observed
 from ..filters.recommendation import short_form
 from ..progress import stage_progress
 from ..pymc_model.posterior_draws import SEQUENTIAL
+from ..sampling.output.warnings import sampler_warning
 from .observed_rows import ObservedRows
 from .output import COURSE, DoubtsOf, as_datatree
 from .request import Request
@@ -26,7 +28,7 @@ def finished(
     *,
     progressbar: bool,
 ) -> xr.DataTree:
-    """The result of a run that is led through all rows of its record."""
+    """The result of a run that is led through all rows of its record, or until an interrupt."""
 
     def on_row(now: Progress) -> None:
         is_last = now.n_rows == n_rows
@@ -38,6 +40,8 @@ def finished(
     with stage_progress(n_rows, enabled=progressbar) as show:
         progress = advance(progress, request, on_row)
     rows, run = progress.rows, progress.as_run()
+    if progress.n_rows < n_rows:
+        log_warnings([_interrupted_warning(progress.n_rows, n_rows)])
     likelihood = run.cloud.others.particles.log_likelihood
     tree = as_datatree(
         rows.model,
@@ -65,6 +69,13 @@ def finished(
     if (state := stored(progress, request)) is not None:
         tree[GROUP] = xr.DataTree(state)
     return tree
+
+
+def _interrupted_warning(n_seen: int, n_rows: int) -> SamplerWarning:
+    return sampler_warning(
+        f"The run was interrupted: the result knows {n_seen} of {n_rows} observations. "
+        "psf.extend goes on from there."
+    )
 
 
 def _observed(rows: ObservedRows) -> Observed:

@@ -12,6 +12,7 @@ weights enter the evidence.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 
 from ..errors import ModelError
 from ..importance import systematic
+from ..parallel.signals import interrupts_are_noted, unless_interrupted
 from ..smc.bridge import Cloud, Crossed, Stage, cross, sizes_of_evidence
 from ..smc.merging import merged_scores
 from ..smc.particles import Populations
@@ -79,10 +81,20 @@ class Progress(NamedTuple):
 
 
 def advance(progress: Progress, request: Request, on_row: Callable[[Progress], None]) -> Progress:
-    """Lead a run through all rows of its record that it has not seen."""
+    """Lead a run through all rows of its record that it has not seen, or until an interrupt.
+
+    After one the record is that of the rows seen, of which there is at least one.
+    """
     while progress.n_rows < len(progress.rows.record.steps):
-        progress = _next_row(progress, request)
+        if progress.n_rows > 0:
+            interrupts_are_noted()
+        following = unless_interrupted(partial(_next_row, progress, request), None)
+        if following is None:
+            seen = progress.rows.record.first(progress.n_rows)
+            return progress._replace(rows=progress.rows.with_record(seen))
+        progress = following
         on_row(progress)
+    interrupts_are_noted()
     return progress
 
 

@@ -9,6 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..filters.protocol import Filter
+from ..parallel.signals import interrupts_are_noted
 from ..pymc_model.other_filter import model_with
 from ..pymc_model.prior import ModelFactors
 from ..smc.bridge import Cloud, Crossed, Stage, cross
@@ -76,6 +77,8 @@ def tempered_run(
     def on_stage(so_far: Crossed) -> None:
         nonlocal visited
         stage = so_far.stages[-1]
+        if stage.temperature == 1.0:
+            interrupts_are_noted()
         if visited is not None:
             new = _visited(so_far.cloud, len(so_far.stages))
             visited = thinned(joined([visited, new]), MOST_VISITED)

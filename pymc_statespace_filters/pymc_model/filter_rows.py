@@ -43,6 +43,10 @@ class Record(NamedTuple):
         """Some rows, with the inputs of all."""
         return self._replace(steps=self.steps[begin:end], observed=self.observed[begin:end])
 
+    def first(self, n_rows: int) -> "Record":
+        """The record that ends with the last of some rows."""
+        return self.rows(0, n_rows)._replace(inputs=self.inputs[: self.steps[n_rows - 1]])
+
 
 class ParametersAtPoints:
     """The parameters of a variable as a function of points of the unconstrained space."""

@@ -11,6 +11,7 @@ from pymc.model import Model
 from xarray import DataTree
 
 from ..errors import ModelError
+from ..parallel.signals import keeps_what_is_there
 from ..pymc_model.density import check_free_variables
 from ..pymc_model.inspection import given_model
 from .checkpoint.checkpoint import checked_folder
@@ -31,6 +32,7 @@ _MOST_THIN = {DRAM: 1024, NUTS: 64}
 _log = logging.getLogger("pymc.sampling.psf")
 
 
+@keeps_what_is_there
 def sample(
     draws: int = 1000,
     tune: int = 1000,

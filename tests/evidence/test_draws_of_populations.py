@@ -26,6 +26,7 @@ from pymc_statespace_filters.evidence.shorter_steps import _changes
 from pymc_statespace_filters.importance import mcse_of_populations
 from pymc_statespace_filters.pymc_model.posterior_draws import BY_PARTICLES, populations_of
 from tests.evidence.targets import Regression
+from tests.waiting import LIMIT
 
 R, N, SCATTER = 8, 100, 0.4
 
@@ -235,7 +236,8 @@ def test_importing_posteriors_leaves_the_statistics_of_arviz_alone():
         "import sys, pymc_statespace_filters.evidence.posterior; "
         "sys.exit('arviz_stats' in sys.modules)"
     )
-    assert subprocess.run([sys.executable, "-c", script], timeout=120, check=False).returncode == 0
+    done = subprocess.run([sys.executable, "-c", script], timeout=LIMIT, check=False)
+    assert done.returncode == 0
 
 
 def test_the_error_of_a_mean_is_that_of_unequal_clusters():

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from tests.waiting import LIMIT
+
 ROOT = Path(__file__).parents[2]
 
 # Said by the environment, because another MPI's mpiexec would refuse an option that it does not
@@ -82,7 +84,7 @@ class Job:
                     os.kill(pid, signal.SIGKILL)
             time.sleep(0.01)
 
-    def wait(self, timeout=120.0):
+    def wait(self, timeout=LIMIT):
         """Wait until all have ended; a job that does not end in time is an error."""
         try:
             stdout, stderr = self.process.communicate(timeout=timeout)
@@ -100,7 +102,7 @@ class Job:
         return Finished(self.process.returncode, stdout, stderr, seconds)
 
 
-def mpiexec(n, script, *args, timeout=120.0, abort=True, env=None):
+def mpiexec(n, script, *args, abort=True, env=None):
     """
     Run a script on ``n`` ranks and wait for it.
 
@@ -111,8 +113,6 @@ def mpiexec(n, script, *args, timeout=120.0, abort=True, env=None):
         A Python file, or other arguments of ``python`` such as ``["-m", "module"]``.
     abort : bool
         By ``python -m mpi4py``, as users should: an error of one rank ends all.
-    timeout : float
-        Seconds after which all ranks are killed and the test fails.
     env : dict, optional
         Environment variables of the job beside ours.
 
@@ -123,10 +123,10 @@ def mpiexec(n, script, *args, timeout=120.0, abort=True, env=None):
     command = [script] if isinstance(script, str | Path) else list(script)
     if abort:
         command = ["-m", "mpi4py", *command]
-    return Job(n, *command, *args, env=env).wait(timeout)
+    return Job(n, *command, *args, env=env).wait()
 
 
-def on_ranks(n, function, *args, timeout=120.0, env=None):
+def on_ranks(n, function, *args, env=None):
     """
     Call a function of a test file on ``n`` ranks, as ``function(comm, *args)``.
 
@@ -139,7 +139,7 @@ def on_ranks(n, function, *args, timeout=120.0, env=None):
         call = (function.__module__, function.__qualname__, args)
         Path(folder, "call").write_bytes(pickle.dumps(call))
         command = ["-W", "error", "-m", "mpi4py", "-m", __name__]
-        done = Job(n, *command, folder, env=env).wait(timeout)
+        done = Job(n, *command, folder, env=env).wait()
         assert done.status == 0, f"exit status {done.status}\n{done.stdout}\n{done.stderr}"
         return [pickle.loads(Path(folder, str(rank)).read_bytes()) for rank in range(n)]
 

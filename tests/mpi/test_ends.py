@@ -6,13 +6,16 @@ The last is interrupted on all ranks, as by a mpiexec that hands Ctrl-C on.
 import os
 import signal
 import time
+from threading import Event
 
 import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.sampling.run.chain_task import ChainTask
+from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
 from tests.mpi.launch import on_ranks
+from tests.waiting import LIMIT
 
 
 def ends(comm):
@@ -34,17 +37,22 @@ def ends(comm):
             psf.sample_dram(**quick | {"comm": psf.Ranks(comm, gather="all")}, progressbar=False)
     heard.append(str(caught.value))
 
-    made, told = ChainTask._advance, []
+    made, stop, told, stopped = ChainTask._advance, ChainPool.stop, [], Event()
 
     def advance_and_interrupt(run):
         made(run)
         if not told:
             told.append(comm.recv(source=1) if comm.rank == 0 else comm.send(None, 0))
             os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(0.05)
+        stopped.wait(LIMIT)
+
+    def stop_all(pool):
+        stopped.set()
+        stop(pool)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ChainTask, "_advance", advance_and_interrupt)
+        patch.setattr(ChainPool, "stop", stop_all)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         tree = psf.sample_dram(
             10**5,

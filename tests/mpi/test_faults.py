@@ -15,6 +15,7 @@ from tests.kernels import with_kernel
 from tests.mpi.launch import Job, mpiexec, on_ranks
 from tests.mpi.programs import resumed
 from tests.sampling.test_sample_dram import state_space_model
+from tests.waiting import wait_until
 
 PROGRAMS = ["-m", "tests.mpi.programs"]
 
@@ -23,8 +24,6 @@ PROGRAMS = ["-m", "tests.mpi.programs"]
 def test_a_model_that_raises_stops_all_ranks(chain, rank, abort):
     """The first chains are those of rank 0."""
     done = mpiexec(2, [*PROGRAMS, "failing"], chain, abort=abort)
-    raised = float(re.search(r"raised at (\S+)", done.stderr).group(1))
-    assert time.time() - raised < 10
     assert done.status == 1
     where = rf"in chain {chain}, after \d+ iterations"
     assert re.search(rf"^ArithmeticError: no more\n{where}", done.stderr, re.MULTILINE)
@@ -97,23 +96,22 @@ def test_ranks_that_make_different_calls_are_told():
 
 def wait_for_a_checkpoint(folder, since):
     """Wait until chains have been stored after a time."""
-    begin = time.monotonic()
-    while time.monotonic() - begin < 60:
+
+    def is_stored():
         stored = [path.stat() for path in folder.glob("run/chains.*/chain-*.segment")]
-        if any(file.st_mtime > since and file.st_size > 10_000 for file in stored):
-            return
-        time.sleep(0.05)
-    raise AssertionError("nothing was stored")
+        return any(file.st_mtime > since and file.st_size > 10_000 for file in stored)
+
+    wait_until(is_stored)
 
 
-def disturb(n, folder, how):
-    """Start the long run, and end it in its midst."""
+def disturb(n, folder, iterations, how):
+    """Start the long run, whose chains make no more than these iterations, and end it."""
     begin = time.time()
-    job = Job(n, "-m", "mpi4py", *PROGRAMS, "long_run", folder, "0.3")
+    job = Job(n, "-m", "mpi4py", *PROGRAMS, "long_run", folder, iterations)
     try:
         wait_for_a_checkpoint(folder, begin)
         how(job)
-        done = job.wait(timeout=15)
+        done = job.wait()
     finally:
         job.end()
     assert done.status != 0
@@ -121,8 +119,8 @@ def disturb(n, folder, how):
 
 
 def test_killed_and_interrupted_and_taken_up_by_other_numbers_of_ranks(tmp_path):
-    disturb(2, tmp_path, lambda job: os.kill(max(job.ranks()), signal.SIGKILL))
-    disturb(3, tmp_path, lambda job: job.process.send_signal(signal.SIGINT))
+    disturb(2, tmp_path, 3000, lambda job: os.kill(max(job.ranks()), signal.SIGKILL))
+    disturb(3, tmp_path, 6000, lambda job: job.process.send_signal(signal.SIGINT))
     done = mpiexec(2, [*PROGRAMS, "long_run"], tmp_path)
     assert done.status == 0, done.stderr
     found = pickle.loads((tmp_path / "draws").read_bytes())

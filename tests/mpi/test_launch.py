@@ -49,7 +49,7 @@ def test_a_signal_to_mpiexec_ends_all_ranks(number):
     job = Job(2, "-c", WAIT)
     wait_until(lambda: len(job.ranks()) >= 2)
     job.process.send_signal(number)
-    done = job.wait(timeout=10)
+    done = job.wait()
     assert done.status != 0
     assert not job.processes()
 

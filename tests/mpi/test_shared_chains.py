@@ -59,7 +59,7 @@ def refusals(comm):
 
 def test_draws_do_not_depend_on_who_evaluates():
     expected = draws_of_all()
-    for found, said in on_ranks(4, shared, timeout=300):
+    for found, said in on_ranks(4, shared):
         for of_groups in found:
             assert of_groups.keys() == expected.keys()
             for what, values in of_groups.items():

@@ -8,6 +8,7 @@ from pathlib import Path
 import pandas as pd
 
 from tests.mpi.launch import ROOT, SETTINGS
+from tests.waiting import LIMIT
 
 EXAMPLE = ROOT / "examples" / "slurm"
 BIN = Path(sys.executable).parent
@@ -21,7 +22,7 @@ def run(command, **environment):
         capture_output=True,
         text=True,
         check=False,
-        timeout=300,
+        timeout=LIMIT,
     )
     assert done.returncode == 0, done.stderr
     return done.stdout

@@ -11,6 +11,7 @@ from pymc_statespace_filters.parallel.shared_rows import (
     outlasting_interrupts,
     rows_shared_by,
 )
+from pymc_statespace_filters.parallel.signals import interrupts_are_noted, keeps_what_is_there
 
 COLUMN = np.arange(5.0)
 
@@ -56,16 +57,25 @@ def test_an_interrupt_ends_a_shared_evaluation():
 
 
 def test_what_outlasts_interrupts_is_evaluated_by_all_ranks_to_its_end():
+    def work():
+        signal.raise_signal(signal.SIGINT)
+        return doubled()[0].tolist()
+
     shared = []
     with rows_shared_by(first_of_two(shared)):
-        with outlasting_interrupts():
-            signal.raise_signal(signal.SIGINT)
-            doubled()
+        assert outlasting_interrupts(work, None) == [0.0, 2.0, 0.0, 0.0, 0.0]
         assert len(shared) == 1
         with pytest.raises(KeyboardInterrupt):
             doubled()
 
 
+@keeps_what_is_there
+def looked_at(look):
+    interrupts_are_noted()
+    return outlasting_interrupts(look, "not looked at")
+
+
+@pytest.mark.usefixtures("interrupts_arrive")
 def test_without_ranks_an_interrupt_ends_it():
-    with outlasting_interrupts():
-        raise KeyboardInterrupt
+    assert looked_at(lambda: "a look") == "a look"
+    assert looked_at(lambda: signal.raise_signal(signal.SIGINT)) == "not looked at"

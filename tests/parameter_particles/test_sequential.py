@@ -9,13 +9,14 @@ from scipy.stats import kstest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
-from pymc_statespace_filters.parameter_particles import output
+from pymc_statespace_filters.parameter_particles import output, sequential_run
 from pymc_statespace_filters.parameter_particles.observed_rows import ObservedRows
 from pymc_statespace_filters.parameter_particles.sequential_run import _variance
 from pymc_statespace_filters.pymc_model.density import ModelDensity
 from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
 from pymc_statespace_filters.smc.merging import merged_log_evidence
 from pymc_statespace_filters.smc.particles import Populations
+from tests.interrupts import interrupt
 from tests.parameter_particles.autoregression import DATA, STEPS, exact, exact_transforms, model
 from tests.systems import FORCED, FREE, counts, pair
 
@@ -53,6 +54,30 @@ def test_evidences_scores_and_posterior_are_exact(by_filter, filter):
     np.testing.assert_allclose(course["score"].sum(), found.attrs["log_evidence"])
     assert course["score"][7] == course["score_se"][7] == 0.0  # a missing row
     assert 0 < course["n_stages"].sum() < 24
+
+
+@pytest.mark.usefixtures("interrupts_arrive")
+def test_an_interrupt_keeps_the_rows_seen(run_of_rows, monkeypatch, caplog):
+    """The result is that of a run of these rows alone, and goes on."""
+    next_row, built = sequential_run._next_row, model(psf.EKF(), 12)
+
+    def interrupted(progress, request):
+        if progress.n_rows == 9:
+            interrupt()
+        return next_row(progress, request)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(sequential_run, "_next_row", interrupted)
+        found = psf.sample_smc(50, model=built, **SETTINGS)
+    assert caplog.messages == [
+        "The run was interrupted: the result knows 9 of 12 observations. psf.extend goes on from "
+        "there."
+    ]
+    longer = psf.extend(found, built, observed=DATA[:12], steps=STEPS[:12], progressbar=False)
+    for tree, expected in ((found, run_of_rows[9]), (longer, run_of_rows[12])):
+        assert tree.attrs["log_evidence"] == expected.attrs["log_evidence"]
+        for group in ("posterior", "smc", "observed_data"):
+            assert tree[group].to_dataset().equals(expected[group].to_dataset())
 
 
 @pytest.mark.parametrize("filter", [psf.EKF(), psf.BootstrapPF(6)])

@@ -2,8 +2,6 @@
 
 import itertools
 import os
-import subprocess
-import sys
 import warnings
 
 import numpy as np
@@ -14,9 +12,10 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import CheckpointWarning, DataMismatchError
 from pymc_statespace_filters.sampling.run import chain_task
 from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
+from tests.interrupts import interrupt
 from tests.kernels import with_kernel
 from tests.sampling.test_sample_dram import assert_identical, sample_dram, state_space_model
-from tests.waiting import wait_until
+from tests.waiting import python, wait_until
 
 KINDS = {
     "deterministic": (psf.EKF(), {}),
@@ -57,14 +56,8 @@ print("done", flush=True)
 
 def kill_after(folder, iterations):
     """Run in a process that is killed once a chain has made so many iterations."""
-    child = subprocess.Popen(
-        [sys.executable, "-c", KILLED, str(folder), str(iterations)],
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    with child:
+    with python("-c", KILLED, folder, iterations) as child:
         assert child.stdout.readline() == "there\n"
-        child.kill()
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
@@ -210,6 +203,7 @@ def test_a_checkpoint_of_other_data(tmp_path):
         sample_dram(model, checkpoint=tmp_path)
 
 
+@pytest.mark.usefixtures("interrupts_arrive")
 def test_an_interrupted_run_goes_on(small, tmp_path, monkeypatch):
     asked = SMALL | {"discard_tuned_samples": False, "checkpoint": tmp_path}
     finished, looks = ChainPool.finished, itertools.count()
@@ -217,7 +211,8 @@ def test_an_interrupted_run_goes_on(small, tmp_path, monkeypatch):
     def interrupted(pool, *others):
         wait_until(lambda: min(task.n_done for task in pool.running.values()) >= 1)
         next(looks)
-        raise KeyboardInterrupt
+        interrupt()
+        return []
 
     monkeypatch.setattr(ChainPool, "finished", interrupted)
     part = sample_dram(small, **with_kernel(asked))

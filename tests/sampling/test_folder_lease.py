@@ -2,8 +2,6 @@
 
 import os
 import re
-import subprocess
-import sys
 import tempfile
 import time
 from contextlib import suppress
@@ -18,7 +16,7 @@ from pymc_statespace_filters.sampling.checkpoint import lease
 from pymc_statespace_filters.sampling.checkpoint.lease import FolderLease, check_held
 from tests.sampling.alone import WITHOUT_PYMC
 from tests.sampling.lease_clock import lease_file, lease_of_elsewhere
-from tests.waiting import wait_until
+from tests.waiting import LIMIT, python, wait_until
 
 with tempfile.TemporaryDirectory() as folder, SoftFileLease(Path(folder, "lease")) as held:
     HOST = held.owner.hostname
@@ -32,7 +30,7 @@ from pathlib import Path
 from pymc_statespace_filters.sampling.checkpoint.lease import FolderLease
 lease = FolderLease(Path(sys.argv[1]))
 print(flush=True)
-time.sleep(100)
+time.sleep(10_000)
 """
 
 
@@ -47,23 +45,24 @@ def heartbeat(path):
 
 
 def test_a_living_process_is_respected_and_a_killed_one_is_not(tmp_path, clock):
-    command = [sys.executable, "-c", HOLDER, str(tmp_path)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
-        try:
-            process.stdout.readline()
-            (path,) = tmp_path.iterdir()
-            assert re.search("host=(.*)", path.read_text())[1] == HOST
-            clock.at_each_sleep.append(lambda: time.sleep(0.5))  # for heartbeats of the process
-            with pytest.raises(ModelError) as caught:
-                FolderLease(tmp_path)
-            assert re.fullmatch(
-                rf"{re.escape(str(tmp_path))} is in use by process {process.pid} on \S+, which "
-                rf"holds {path.name}: wait for its end or give another path",
-                str(caught.value),
-            )
-            assert names(tmp_path) == [path.name]
-        finally:
-            process.kill()
+    with python("-c", HOLDER, tmp_path) as process:
+        process.stdout.readline()
+        (path,) = tmp_path.iterdir()
+        assert re.search("host=(.*)", path.read_text())[1] == HOST
+        touched = path.stat().st_mtime_ns
+
+        def heard():
+            return path.stat().st_mtime_ns != touched
+
+        clock.at_each_sleep.append(lambda: wait_until(heard))
+        with pytest.raises(ModelError) as caught:
+            FolderLease(tmp_path)
+        assert re.fullmatch(
+            rf"{re.escape(str(tmp_path))} is in use by process {process.pid} on \S+, which "
+            rf"holds {path.name}: wait for its end or give another path",
+            str(caught.value),
+        )
+        assert names(tmp_path) == [path.name]
     clock.now = 0
     FolderLease(tmp_path).release()
     assert clock.now == 0  # the table of processes tells at once
@@ -228,7 +227,7 @@ def test_of_two_newcomers_the_first_gets_the_folder(tmp_path, monkeypatch):
             with suppress(FileNotFoundError):  # the other one has ended
                 heartbeat(path)
         try:
-            step.wait(30)
+            step.wait(LIMIT)
         except BrokenBarrierError:
             pass  # the other one has ended
 
@@ -250,7 +249,7 @@ def test_of_two_newcomers_the_first_gets_the_folder(tmp_path, monkeypatch):
             path.write_text(re.sub("host=.*", f"host=node-{name}", path.read_text()))
             living.append(path)
     for thread in threads:
-        thread.join(60)
+        thread.join(LIMIT)
     assert "on node-first" in str(got["second"])
     assert names(tmp_path) == [got["first"].path.name]
     got["first"].release()

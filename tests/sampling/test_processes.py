@@ -18,11 +18,11 @@ import pytest
 
 import pymc_statespace_filters as psf
 from tests.systems import FREE
+from tests.waiting import LIMIT
 
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
-SECONDS = 120
 
 
 def draws():
@@ -57,9 +57,9 @@ def test_a_child_process_draws_the_same(method):
     child.start()
     sender.close()
     try:
-        assert receiver.poll(SECONDS), "no draws in time"
+        assert receiver.poll(LIMIT), "no draws in time"
         np.testing.assert_array_equal(receiver.recv(), wanted)
-        child.join(SECONDS)
+        child.join(LIMIT)
         assert child.exitcode == 0
     finally:
         child.kill()
@@ -100,7 +100,7 @@ def test_without_the_rights_of_root(tmp_path, may_write):
         | {"PYTENSOR_FLAGS": f"base_compiledir={tmp_path.as_posix()},blas__ldflags=,cxx="},
         capture_output=True,
         text=True,
-        timeout=4 * SECONDS,
+        timeout=LIMIT,
         check=False,
     )
     if may_write:

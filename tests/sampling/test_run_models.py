@@ -21,8 +21,8 @@ from pymc_statespace_filters.sampling.run.request import RunArguments, SamplingR
 from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
 from pymc_statespace_filters.sampling.target import target
 from pymc_statespace_filters.sampling.target.settings import RandomWalkSettings
+from tests.interrupts import interrupt, interrupt_chains
 from tests.sampling.test_sample_dram import assert_identical, sample_dram, state_space_model
-from tests.waiting import wait_until
 
 SETTINGS = {"draws": 50, "tune": 50, "chains": 2, "random_seed": 1, "progressbar": False}
 
@@ -87,17 +87,14 @@ def test_threads_are_shared_by_all_models(models, monkeypatch):
     assert max(at_once) >= 3  # with those that wait for a thread to go on
 
 
+@pytest.mark.usefixtures("interrupts_arrive")
 def test_an_interrupted_study_goes_on(models, tmp_path, monkeypatch):
     settings = SETTINGS | {"tune": 400}  # long enough for a search by the expensive filter
     expected = psf.run_models(models, **settings)
     settings |= {"checkpoint": tmp_path, "cores": 2}
 
-    def interrupted(pool, *others):
-        wait_until(lambda: min(task.n_done for task in pool.running.values()) >= 10)
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr(ChainPool, "finished", interrupted)
+        interrupt_chains(patch)
         with pytest.raises(KeyboardInterrupt, match="before there was a draw"):  # in the warm-up
             psf.run_models(models, **settings)
     stored = [
@@ -113,15 +110,17 @@ def test_an_interrupted_study_goes_on(models, tmp_path, monkeypatch):
         psf.run_models(models, **settings | {"draws": 60})
 
 
+@pytest.mark.usefixtures("interrupts_arrive")
 def test_an_interrupt_keeps_the_model_that_has_draws(models, monkeypatch, caplog):
     """With one thread, the chains of the dear one have all ended before the others begin."""
     start, begun = ChainPool.start, []
 
     def interrupted(pool, number, task):
         begun.append(number)
-        if len(begun) == 3:  # the first chain of the cheap one
-            raise KeyboardInterrupt
-        start(pool, number, task)
+        if len(begun) > 2:  # of the cheap one
+            interrupt()
+        else:
+            start(pool, number, task)
 
     settings = SETTINGS | {"tune": 0, "cores": 1}
     expected = psf.run_models({"dear/one": models["dear/one"]}, **settings)
@@ -132,8 +131,7 @@ def test_an_interrupt_keeps_the_model_that_has_draws(models, monkeypatch, caplog
     assert trees["dear/one"].sizes == expected["dear/one"].sizes
     (said,) = [r.message for r in caplog.records if "interrupted" in r.message]
     assert said == (
-        "The run was interrupted before the chains of model 'cheap one' had made a draw: the "
-        "results lack this model."
+        "The run was interrupted before model 'cheap one' had a draw: the results lack this model."
     )
 
 

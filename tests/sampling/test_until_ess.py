@@ -18,6 +18,7 @@ from pymc_statespace_filters.progress import ChainProgress
 from pymc_statespace_filters.sampling.output.convergence import MAX_RHAT, convergence
 from pymc_statespace_filters.sampling.run import chain_task, model_task, scheduler
 from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
+from tests.interrupts import interrupt
 from tests.sampling.test_dram import simple_model
 from tests.sampling.test_sample_dram import LOGGER, assert_identical, sample_dram
 
@@ -247,6 +248,7 @@ def test_a_run_that_died_goes_on_as_if_it_had_not(
     assert_identical(sample_dram(model, checkpoint=tmp_path, **RULE), stopped)
 
 
+@pytest.mark.usefixtures("interrupts_arrive")
 def test_ctrl_c_in_a_later_round_returns_what_is_there(model, stopped, tmp_path, monkeypatch):
     finished, go_on, rounds = ChainPool.finished, ChainPool.go_on, []
 
@@ -257,7 +259,7 @@ def test_ctrl_c_in_a_later_round_returns_what_is_there(model, stopped, tmp_path,
 
     def interrupted(pool, *seconds):
         if rounds:
-            raise KeyboardInterrupt
+            interrupt()
         return finished(pool, *seconds)
 
     with monkeypatch.context() as patch:

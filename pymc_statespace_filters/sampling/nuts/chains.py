@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from nutpie.compiled_pyfunc import from_pyfunc
 from xarray import DataTree
 
+from ...parallel.signals import interrupts_are_noted, takes_interrupt
 from ...progress import ChainProgress
 from ..output.convergence import Convergence, convergence
 from ..run.request import SamplingRequest
@@ -83,6 +84,7 @@ def run_nuts(
         make_initial_point_fn=lambda seed: start(np.random.default_rng(seed)),
     )
     began = time.monotonic()
+    interrupts_are_noted()
     with ChainProgress(request.chains, request.draws, request.tune, progressbar) as bars:
         sampler = nutpie.sample(
             model,
@@ -115,28 +117,27 @@ def _followed(
 ) -> NutsChains:
     """Wait for the chains, and end them at the first length whose draws are worth enough."""
     length, found, is_stuck = first_length(request), None, False
-    with suppress(KeyboardInterrupt):
-        while True:
-            time.sleep(_SECONDS)
-            made = [chain.finished_draws for chain in watch.chains]
-            for i, chain in enumerate(watch.chains):
-                bars.update(i, chain.finished_draws, _shown(chain))
-            is_over = _is_finished(sampler)
-            if not is_over and (not made or min(made) < request.tune + length.n_iterations):
-                continue
-            trace = sampler.inspect()
-            positions = _positions(trace)
-            rows = slice(length.thin - 1, length.n_iterations, length.thin)
-            before, found = found, convergence(list(positions[:, rows]))
-            longer = next_length(request, length, found, time.monotonic() - began)
-            is_stuck = longer is not None and _is_stuck(trace, rows, before, found)
-            if is_stuck or longer is None:
-                break
-            if is_over and _n_made(positions) < longer.n_iterations:
-                break
-            length = longer
-            for i in range(request.chains):
-                bars.extend(i, request.tune + length.n_iterations)
+    while not takes_interrupt():
+        time.sleep(_SECONDS)
+        made = [chain.finished_draws for chain in watch.chains]
+        for i, chain in enumerate(watch.chains):
+            bars.update(i, chain.finished_draws, _shown(chain))
+        is_over = _is_finished(sampler)
+        if not is_over and (not made or min(made) < request.tune + length.n_iterations):
+            continue
+        trace = sampler.inspect()
+        positions = _positions(trace)
+        rows = slice(length.thin - 1, length.n_iterations, length.thin)
+        before, found = found, convergence(list(positions[:, rows]))
+        longer = next_length(request, length, found, time.monotonic() - began)
+        is_stuck = longer is not None and _is_stuck(trace, rows, before, found)
+        if is_stuck or longer is None:
+            break
+        if is_over and _n_made(positions) < longer.n_iterations:
+            break
+        length = longer
+        for i in range(request.chains):
+            bars.extend(i, request.tune + length.n_iterations)
     seconds = time.monotonic() - began
     return _kept(sampler.abort(), length, found, seconds)._replace(is_stuck=is_stuck)
 

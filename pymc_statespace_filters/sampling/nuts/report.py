@@ -6,6 +6,7 @@ import numpy as np
 from pymc.model import Model
 from pymc.stats.convergence import SamplerWarning, WarningType
 
+from ...parallel.signals import is_interrupted
 from ..output.convergence import MAX_RHAT
 from ..output.remedies import reaches_zero, without_transform
 from ..output.report import until_ess_warning
@@ -44,7 +45,8 @@ def messages_of(
         arguments = request.until_ess, n, chains.seconds, chains.found, names, remedy
         problems.append(until_ess_warning(*arguments))
     text = _report(chains, request, names)
-    if not problems and chains.found is not None and chains.found.rhat.max() <= MAX_RHAT:
+    is_good = chains.found is not None and chains.found.rhat.max() <= MAX_RHAT
+    if is_good and not problems and not is_interrupted():
         text += " No problems found."
     return [*problems, SamplerWarning(WarningType.CONVERGENCE, text, level)]
 

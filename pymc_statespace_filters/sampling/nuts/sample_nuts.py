@@ -1,17 +1,17 @@
 """A whole run of NUTS, from the request to the DataTree."""
 
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
 from pymc.initial_point import make_initial_point_fn
 from pymc.model import Model
-from pymc.stats.convergence import log_warnings
+from pymc.stats.convergence import SamplerWarning, log_warnings
 from xarray import DataTree
 
 from ...errors import ModelError
 from ...parallel.cpu_affinity import available_cores
+from ...parallel.signals import keeps_what_is_there, unless_interrupted
 from ...pymc_model.elements import element_names
 from ...pymc_model.inspection import exactness, filters_used
 from ..output.datatree import to_datatree
@@ -32,6 +32,7 @@ from .report import messages_of
 Array = NDArray[np.float64]
 
 
+@keeps_what_is_there
 def sample_nuts(model: Model, request: SamplingRequest, options: ExecutionOptions) -> DataTree:
     """Draw from the posterior by nutpie; errors are those of `sample`."""
     options.check()
@@ -53,11 +54,15 @@ def sample_nuts(model: Model, request: SamplingRequest, options: ExecutionOption
     if not chains.positions.shape[1]:
         raise KeyboardInterrupt("the run was interrupted before there was a draw to return")
     tree = _tree(model, target, chains, request)
-    missed, check = [], FilterCheck()
-    with suppress(KeyboardInterrupt):
-        missed = unvisited_warnings(tree, model, chains.seconds, rng) + step_warnings(tree, model)
-        iterations = request.tune + chains.length.n_iterations
-        check = check_filters(tree, model, iterations, chains.seconds, rng)
+    nothing: list[SamplerWarning] = []
+    missed = [
+        *unless_interrupted(lambda: unvisited_warnings(tree, model, chains.seconds, rng), nothing),
+        *unless_interrupted(lambda: step_warnings(tree, model), nothing),
+    ]
+    iterations = request.tune + chains.length.n_iterations
+    check = unless_interrupted(
+        lambda: check_filters(tree, model, iterations, chains.seconds, rng), FilterCheck()
+    )
     level = "info" if progressbar else "debug"
     names = element_names(model, target.raveled.variables)
     messages = messages_of(model, chains, missed, request, names, level)

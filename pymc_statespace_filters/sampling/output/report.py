@@ -138,8 +138,7 @@ def left_out_warnings(lengths: Sequence[int], skipped: int) -> list[SamplerWarni
 def no_draws_warning(name: str) -> SamplerWarning:
     """Warn of a model that the results of an interrupted run lack."""
     return sampler_warning(
-        f"The run was interrupted before the chains of model {name!r} had made a draw: the results "
-        "lack this model."
+        f"The run was interrupted before model {name!r} had a draw: the results lack this model."
     )
 
 

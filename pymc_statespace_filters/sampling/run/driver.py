@@ -27,6 +27,7 @@ from ...errors import ModelError
 from ...parallel.agreement import check_same_call
 from ...parallel.communicator import Communicator, communicator_of
 from ...parallel.cpu_affinity import allowed_cores, cores_per_process
+from ...parallel.signals import keeps_what_is_there
 from ..checkpoint.checkpoint import join_checkpoint, open_checkpoint
 from ..output.report import no_draws_warning
 from ..target.leader_follower import follow, release_followers
@@ -41,6 +42,7 @@ _SEED_ADVICE = (
 _PILOT_ADVICE = ', and the same pilot, which psf.Ranks(gather="all") gives to all ranks'
 
 
+@keeps_what_is_there
 def sample_models(
     models: Mapping[str, Model],
     requests: Sequence[SamplingRequest],

@@ -1,7 +1,6 @@
 """What the chains of a model have found: the DataTree, the report and the warnings."""
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -10,6 +9,7 @@ from pymc.model import Model
 from pymc.stats.convergence import SamplerWarning, WarningType, log_warnings
 from xarray import DataTree
 
+from ...parallel.signals import is_interrupted, unless_interrupted
 from ...pymc_model.elements import element_names
 from ...pymc_model.inspection import filters_used
 from ..kernel.state import ChainState, Draws, side_generator
@@ -86,7 +86,8 @@ class ModelResult:
         closing = left_out_warnings([len(d.positions) for d, _ in results], request.n_skipped)
         states = self._stored_states()
         warnings = chain_warnings(target, results, request.tune, self.length.thin)
-        attrs, noise_warnings = self._measure_noise()
+        unknown: tuple[dict[str, float], list[SamplerWarning]] = {}, []
+        attrs, noise_warnings = unless_interrupted(self._measure_noise, unknown)
         unreached = self._unreached_warnings([draws for draws, _ in results])
         key = results[0][1].key
         chains = []
@@ -111,17 +112,16 @@ class ModelResult:
         }
         if states is not None:
             tree[GROUP] = states
+        check = FilterCheck()
         if check_convergence and "posterior" in tree:
-            with suppress(KeyboardInterrupt):
-                rng = side_generator(key, 3)
-                noise_warnings += unvisited_warnings(tree, self.model, self.seconds, rng)
-                noise_warnings += step_warnings(tree, self.model)
-        check = self._check_filters(tree, key) if check_convergence else FilterCheck()
+            noise_warnings += unless_interrupted(lambda: self._unvisited_warnings(tree, key), [])
+            noise_warnings += unless_interrupted(lambda: step_warnings(tree, self.model), [])
+            check = unless_interrupted(lambda: self._check_filters(tree, key), check)
         noise_warnings += unreached
         if not unreached and warnings.keys().isdisjoint({STANDSTILL, LOWER}):  # which explain it
             noise_warnings += mixing
         said = [*warnings.values(), *noise_warnings, *closing]
-        if not said and not check.warned and check_convergence:
+        if not said and not check.warned and check_convergence and not is_interrupted():
             report += " No problems found."
         said += [SamplerWarning(WarningType.CONVERGENCE, report, report_level)] if report else []
         said += check.messages(report_level)
@@ -143,13 +143,14 @@ class ModelResult:
             settings=request.settings,
         )
 
+    def _unvisited_warnings(self, tree: DataTree, key: np.ndarray) -> list[SamplerWarning]:
+        """Warn of what the chains have missed of the posterior."""
+        return unvisited_warnings(tree, self.model, self.seconds, side_generator(key, 3))
+
     def _check_filters(self, tree: DataTree, key: np.ndarray) -> FilterCheck:
         """Compare the filters with unbiased ones at some draws."""
-        if "posterior" in tree:
-            with suppress(KeyboardInterrupt):
-                rng = side_generator(key, 2)
-                return check_filters(tree, self.model, self.n_iterations, self.seconds, rng)
-        return FilterCheck()
+        rng = side_generator(key, 2)
+        return check_filters(tree, self.model, self.n_iterations, self.seconds, rng)
 
     def _closing_messages(self, check_convergence: bool) -> tuple[str, list[SamplerWarning]]:
         """The report, empty without draws, and a warning if the chains have not mixed."""
@@ -200,17 +201,16 @@ class ModelResult:
         """Measure the likelihood's noise after a complete run: an attribute, and warnings."""
         request, target, results = self.request, self.target, self.results
         lengths = {len(draws.positions) for draws, _ in results}
-        if self.measures_noise and lengths == {request.tune + self.length.draws}:
-            with suppress(KeyboardInterrupt):
-                keys = [state.key for _, state in results]
-                spread, warning = spread_at_highest_draw(
-                    [draws for draws, _ in results],
-                    request.tune if request.draws else 0,
-                    chain_of(target, keys[0], 0, 0).seed_spread,
-                    keys,
-                    target,
-                )
-                is_said = self.is_noisy and TOO_NOISY < spread.variance < np.inf
-                warnings = [] if warning is None or is_said else [warning]
-                return {"log_likelihood_variance": spread.variance}, warnings
-        return {}, []
+        if not self.measures_noise or lengths != {request.tune + self.length.draws}:
+            return {}, []
+        keys = [state.key for _, state in results]
+        spread, warning = spread_at_highest_draw(
+            [draws for draws, _ in results],
+            request.tune if request.draws else 0,
+            chain_of(target, keys[0], 0, 0).seed_spread,
+            keys,
+            target,
+        )
+        is_said = self.is_noisy and TOO_NOISY < spread.variance < np.inf
+        warnings = [] if warning is None or is_said else [warning]
+        return {"log_likelihood_variance": spread.variance}, warnings

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Mapping
-from contextlib import suppress
 from functools import cached_property
 
 import numpy as np
@@ -10,6 +9,7 @@ from pymc.model import Model
 from xarray import DataTree
 
 from ...parallel.communicator import Communicator
+from ...parallel.signals import unless_interrupted
 from ..checkpoint.checkpoint import Checkpoint
 from ..kernel.state import ChainState, Draws
 from ..output.convergence import Convergence, convergence
@@ -293,9 +293,8 @@ class ModelTask:
         The task keeps no results: the draws are in memory twice, but never three times.
         """
         request, found, is_complete = self.request, None, self.is_complete
-        with suppress(KeyboardInterrupt):
-            if check_convergence or request.until_ess is not None:
-                found = self.convergence()
+        if check_convergence or request.until_ess is not None:
+            found = unless_interrupted(self.convergence, None)
         result = ModelResult(
             self.model,
             request,

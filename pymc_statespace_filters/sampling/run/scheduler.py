@@ -16,14 +16,14 @@ Interrupts are handled by rank 0. The progress bar shows R-hat and the effective
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
 from ...errors import ParallelError
 from ...parallel.communicator import ABORT_GRACE_SECONDS, Communicator, describe_error
-from ...parallel.signals import deferred_interrupts, ignored_interrupts
+from ...parallel.signals import ignored_interrupts, interrupts_are_noted, takes_interrupt
 from ...progress import ChainProgress
 from ..kernel.state import ChainState, Draws
 from .chain_task import ChainTask
@@ -114,20 +114,20 @@ class _Manager:
 
     def run(self) -> None:
         """Run all chains, on this rank and the others."""
-        with deferred_interrupts() as interrupted:
-            with self._bars, suppress(KeyboardInterrupt):
-                while self._n_unfinished and not interrupted.is_set():
-                    self._continue()
-            self._is_stopping = True
-            self._pool.stop()
-            for number, task in self._pool.running.items():
-                self._add_result(number, *task.result())
-            self._schedule.clear()
-            if self._n_unfinished:
-                self._comm.send_to_others(_STOP)
-            while self._workers:
-                time.sleep(_LISTENING_SECONDS)
-                self._receive()
+        interrupts_are_noted()
+        with self._bars:
+            while self._n_unfinished and not takes_interrupt():
+                self._continue()
+        self._is_stopping = True
+        self._pool.stop()
+        for number, task in self._pool.running.items():
+            self._add_result(number, *task.result())
+        self._schedule.clear()
+        if self._n_unfinished:
+            self._comm.send_to_others(_STOP)
+        while self._workers:
+            time.sleep(_LISTENING_SECONDS)
+            self._receive()
         for model_task in self._tasks:
             model_task.load_missing_results()
 

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import suppress
 from threading import Event
 from typing import Self
 
@@ -76,12 +75,11 @@ class ChainPool:
         return [(number, self.running.pop(number)) for number in numbers]
 
     def stop(self) -> None:
-        """Stop all chains and wait for them, ignoring further interrupts."""
+        """Stop all chains and wait for them."""
         self._stop.set()
         unfinished = set(self._futures)
         while unfinished:
-            with suppress(KeyboardInterrupt):
-                for task in self.running.values():
-                    task.request_pause(self._stop)
-                _, unfinished = wait(unfinished, timeout=_REFRESH_SECONDS)
+            for task in self.running.values():
+                task.request_pause(self._stop)
+            _, unfinished = wait(unfinished, timeout=_REFRESH_SECONDS)
         self._futures.clear()
