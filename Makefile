@@ -27,7 +27,7 @@ EXECUTE = cache
 STUDIES = hidden_state validation double_well mass_spring_damper model_choice airfoil
 
 .DEFAULT_GOAL := help
-.PHONY: help environment demo demo-quick thesis thesis-quick published paper preview test test-mpi test-slow test-latest lint docs linkcheck release-check bench bench-quick bench-mpi lock clean
+.PHONY: help environment demo demo-quick thesis thesis-quick published paper preview test test-mpi test-slow test-latest lint docs linkcheck release-quick release-check bench bench-quick bench-mpi lock clean
 
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
@@ -84,6 +84,9 @@ docs: $(VENV)/.installed  ## build the guide in docs/_build/html; takes half a m
 
 linkcheck: $(VENV)/.installed  ## check the guide's links to other sites; needs network access
 	$(IN)/python -m sphinx -E -W --keep-going --quiet -D nb_execution_mode=off -b linkcheck docs docs/_build/linkcheck
+
+release-quick: $(VENV)/.installed  ## build wheel and sdist, and check their contents, size and metadata; takes seconds, needs git
+	$(IN)/python packaging/release_check.py --quick
 
 release-check:  ## build wheel and sdist into dist/, install them elsewhere and test them; takes six minutes, needs git and a registry
 	@$(if $(PYTHON),,$(NO_PYTHON))

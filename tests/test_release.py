@@ -1,6 +1,7 @@
 """What a release says of itself in several places is the same in all of them."""
 
 import re
+import runpy
 import tomllib
 from importlib.metadata import version
 from pathlib import Path
@@ -80,3 +81,13 @@ def test_workflows_have_every_python_that_is_promised():
         "matrix"
     ]
     assert set(matrix["python"]) == classified
+
+
+def test_a_wheel_that_has_grown_fails_the_release_check(tmp_path, capsys):
+    """The quick part of the check, which builds both distributions, is a step of .ci/run."""
+    assert "make release-quick" in text_of(".ci/run")
+    check = runpy.run_path(str(ROOT / "packaging" / "release_check.py"))
+    wheel = tmp_path / "pymc_statespace_filters-0.1.0-py3-none-any.whl"
+    wheel.write_bytes(bytes(check["MAX_WHEEL_BYTES"]))
+    with pytest.raises(SystemExit, match=f"{wheel.name} has 1300000 bytes, not below 1300000"):
+        check["check_wheel"](wheel)
