@@ -63,7 +63,6 @@ class ChainProgress(ProgressBarManager):
     --------
     >>> from pymc_statespace_filters.progress import ChainProgress
     >>> with ChainProgress(n_chains=1, draws=1000, tune=500, progressbar=False) as bars:
-    ...     bars.begin(0)
     ...     bars.update(0, 1500, {"accept_rate": 0.3, "n_failed": 0})
     """
 
@@ -100,12 +99,8 @@ class ChainProgress(ProgressBarManager):
         """Whether `show_convergence` has an effect."""
         return self._show_progress and self.full_stats
 
-    def begin(self, chain: int) -> None:
-        """Start the clock of a chain; without this it starts at the first update."""
-        self._advance(chain, 0, {"failing": False})
-
     def update(self, chain: int, done: int, stats: Mapping[str, Any], seconds: float = 0.0) -> None:
-        """Show how many iterations a chain has made.
+        """Show how many iterations a chain has made; its clock starts with the first of them.
 
         Parameters
         ----------
@@ -228,6 +223,7 @@ def row_progress(
         if enabled:
             work.on_progress = bar.advance
         yield bar.begin if enabled else lambda task, total: None
+        bar.begin("", 0)  # the last task is done
 
 
 @contextmanager

@@ -1,6 +1,6 @@
 """`run_models`: the posteriors of several models in one call, by chains or by particles."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import fields
 from functools import partial
@@ -18,15 +18,23 @@ from .former_names import former_names
 from .parallel.signals import keeps_what_is_there, unless_interrupted
 from .parameter_particles import sample_smc
 from .sampling.checkpoint.checkpoint import checked_folder, folder_name
+from .sampling.chosen_sampler import sample, sample_named
 from .sampling.output.report import no_draws_warning
 from .sampling.run.driver import sample_models
 from .sampling.run.request import RunArguments
+from .sampling.run.stopping import AUTO
 from .sampling.run.warm_start import warm_started_models
 from .sampling.target.settings import FORMER_ARGUMENTS
 
+_OF_SAMPLE = {"model", "sampler", "continue_from", "checkpoint", "comm"}
 _SAMPLERS = {
+    "auto": ("sample", signature(sample).parameters.keys() - _OF_SAMPLE),
+    "nuts": ("sample", signature(sample).parameters.keys() - _OF_SAMPLE),
     "dram": ("sample_dram", {field.name for field in fields(RunArguments)}),
-    "smc": ("sample_smc", signature(sample_smc).parameters.keys() - {"model"}),
+    "smc": (
+        "sample_smc",
+        signature(sample_smc).parameters.keys() - {"model", "checkpoint", "comm"},
+    ),
 }
 
 
@@ -47,23 +55,24 @@ def run_models(
 def run_models(
     models: Mapping[str, Model],
     *,
-    sampler: Literal["dram", "smc"] = "dram",
+    sampler: Literal["auto", "nuts", "dram", "smc"] = "dram",
     pilot: DataTree | Mapping[str, DataTree] | None = None,
     checkpoint: Any = None,
     comm: Any = None,
     **settings: Any,
 ) -> dict[str, DataTree] | None:
-    """Sample several models in one run, each as by `sample_dram` or `sample_smc`.
+    """Sample several models in one run, each as by `sample`, `sample_dram` or `sample_smc`.
 
-    The chains of all models share the threads, and with MPI the ranks: an idle thread takes the
-    next chain, most expensive model first. Runs of `sample_smc`, each of which uses all threads,
-    follow one another, and store the evidences for `compare_evidence`.
+    The chains of `sample_dram` of all models share the threads, and with MPI the ranks: an idle
+    thread takes the next chain, most expensive model first. Runs of the others, each of which uses
+    all threads, follow one another; those of `sample_smc` store the evidences for
+    `compare_evidence`.
 
     Parameters
     ----------
     models : mapping of str to pymc.Model
-    sampler : {"dram", "smc"}
-        `sample_dram` or `sample_smc`.
+    sampler : {"dram", "auto", "nuts", "smc"}
+        "auto" and "nuts" are those of `sample`, "dram" is `sample_dram`, and "smc" `sample_smc`.
     pilot : xarray.DataTree, or mapping of str to xarray.DataTree, optional
         As in `sample_dram`, of the models with these names. A single one is the pilot of every
         model that has a free variable in common with it. Only with "dram".
@@ -73,11 +82,12 @@ def run_models(
     comm
         As in `sample_dram`.
     **settings
-        The other arguments of the sampler, for every model; of `sample_dram` ``draws``, ``tune``,
-        ``until_ess``, ``max_draws``, ``thin``, ``chains``, ``cores``, ``random_seed``,
-        ``initvals``, ``kernel``, ``progressbar``, ``discard_tuned_samples``,
-        ``compute_convergence_checks``. A model's draws are those of the sampler with the same seed
-        and do not depend on the other models; with ``until_ess`` each stops on its own.
+        The other arguments of the sampler, for every model; of `sample` ``draws``, ``tune``,
+        ``until_ess``, ``max_draws``, ``chains``, ``cores``, ``kernel``, ``initvals``,
+        ``random_seed`` and ``progressbar``, of `sample_dram` also ``thin``,
+        ``discard_tuned_samples`` and ``compute_convergence_checks``. A model's draws are those of
+        the sampler with the same seed and do not depend on the other models; with ``until_ess``
+        each stops on its own.
 
     Returns
     -------
@@ -121,11 +131,14 @@ def run_models(
     if checkpoint is not None:
         folder = checked_folder(checkpoint)
         folders = [Path(folder, folder_name(name)) for name in models]
-    if sampler == "smc":
+    if sampler != "dram":
         if pilot is not None:
-            raise ModelError("pilot must be None with sampler='smc', which starts from the prior")
+            raise ModelError(
+                f"pilot must be None with sampler={sampler!r}: sampler='dram' starts from one"
+            )
         stored_in = dict(zip(models, folders, strict=False))
-        return _particles(models, settings, stored_in, comm)
+        run = _by_particles if sampler == "smc" else partial(_by_chains, sampler)
+        return _one_by_one(models, run, settings, stored_in, comm)
     given = RunArguments(**settings)
     requests = warm_started_models(given.request(), models, pilot)
     return sample_models(models, requests, given.options(comm), folders)
@@ -144,18 +157,33 @@ def _check_models(models: Mapping[str, Model]) -> None:
             raise ModelError(f"models[{name!r}] must be a pymc.Model, got {model!r}")
 
 
-def _particles(
-    models: Mapping[str, Model], settings: Mapping[str, Any], folders: Mapping[str, Path], comm: Any
+def _by_particles(name: str, model: Model, **settings: Any) -> DataTree | None:
+    return sample_smc(model=model, **settings)
+
+
+def _by_chains(
+    sampler: str, name: str, model: Model, comm: Any, checkpoint: Any, **settings: Any
+) -> DataTree | None:
+    given = RunArguments(**{"until_ess": AUTO, **settings})
+    return sample_named(name, model, given, sampler, comm=comm, checkpoint=checkpoint)
+
+
+def _one_by_one(
+    models: Mapping[str, Model],
+    run: Callable[..., DataTree | None],
+    settings: Mapping[str, Any],
+    folders: Mapping[str, Path],
+    comm: Any,
 ) -> dict[str, DataTree] | None:
-    """Every model by `sample_smc`, with the same seed; None on ranks that do not get them."""
+    """Every model, with the same seed; None on ranks that do not get them."""
     seed, found = settings.get("random_seed"), {}
 
     def add(name: str, model: Model) -> None:
         # Each gets the numbers that a generator would give the first.
         own = deepcopy(seed) if isinstance(seed, np.random.Generator) else seed
+        changed = {"random_seed": own, "checkpoint": folders.get(name), "comm": comm}
         try:
-            own_settings = {**settings, "random_seed": own, "checkpoint": folders.get(name)}
-            tree = sample_smc(model=model, comm=comm, **own_settings)
+            tree = run(name=name, model=model, **{**settings, **changed})
         except Exception as error:
             error.add_note(f"in model {name!r}")
             raise

@@ -16,6 +16,7 @@ from ..pymc_model.density import check_free_variables
 from ..pymc_model.inspection import given_model
 from .checkpoint.checkpoint import checked_folder
 from .choice import DRAM, NUTS, Choice, choose_sampler, why_no_nuts
+from .output.warnings import of_model
 from .run.continuation import appended, former_chains
 from .run.driver import sample_models
 from .run.request import RunArguments, SamplingRequest
@@ -32,7 +33,6 @@ _MOST_THIN = {DRAM: 1024, NUTS: 64}
 _log = logging.getLogger("pymc.sampling.psf")
 
 
-@keeps_what_is_there
 def sample(
     draws: int = 1000,
     tune: int = 1000,
@@ -127,40 +127,52 @@ def sample(
     >>> idata["posterior"]["mu"].shape, idata.attrs["sampler"]
     ((4, 500), 'dram')
     """
-    model = given_model(model)
-    check_free_variables(model)
-    choice = _choice(
-        model,
-        sampler,
-        {
-            "kernel": kernel,
-            "continue_from": continue_from,
-            "checkpoint": checkpoint,
-            "comm": comm,
-        },
-        chains=chains,
-        tune=tune,
-    )
     given = RunArguments(
         draws=draws, tune=tune, until_ess=until_ess, max_draws=max_draws, chains=chains,
         cores=cores, random_seed=random_seed, initvals=initvals, kernel=kernel,
         progressbar=progressbar,
     )  # fmt: skip
+    return sample_named(
+        "", given_model(model), given, sampler, continue_from=continue_from, checkpoint=checkpoint,
+        comm=comm,
+    )  # fmt: skip
+
+
+@keeps_what_is_there
+def sample_named(
+    name: str,
+    model: Model,
+    given: RunArguments,
+    sampler: str,
+    *,
+    continue_from: DataTree | None = None,
+    checkpoint: str | os.PathLike | None = None,
+    comm: Any = None,
+) -> DataTree | None:
+    """`sample` a model whose messages have its name, if it has one."""
+    check_free_variables(model)
+    only_dram = {
+        "kernel": given.kernel,
+        "continue_from": continue_from,
+        "checkpoint": checkpoint,
+        "comm": comm,
+    }
+    choice = _choice(model, sampler, only_dram, chains=given.chains, tune=given.tune)
     request = _request(choice.sampler, given)
     if continue_from is not None:
         request = _continued(request, continue_from, model)
-    level = logging.INFO if progressbar else logging.DEBUG
-    _log.log(level, "%s: %s", _NAMES[choice.sampler], choice.reason)
+    level = logging.INFO if given.progressbar else logging.DEBUG
+    _log.log(level, "%s%s: %s", of_model(name), _NAMES[choice.sampler], choice.reason)
     options = given.options(comm)
     tree: DataTree | None
     if choice.sampler == NUTS:
         from .nuts.sample_nuts import sample_nuts  # nutpie takes longer to import than the rest
 
-        tree = sample_nuts(model, request, options)
+        tree = sample_nuts(model, request, options, name)
     else:
         folders = [] if checkpoint is None else [checked_folder(checkpoint)]
-        trees = sample_models({"": model}, [request], options, folders)
-        tree = None if trees is None else trees[""]
+        trees = sample_models({name: model}, [request], options, folders)
+        tree = None if trees is None else trees[name]
         if continue_from is not None and tree is not None:
             tree = appended(continue_from, tree)
     if tree is not None:

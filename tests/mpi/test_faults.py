@@ -99,7 +99,7 @@ def wait_for_a_checkpoint(folder, since):
 
     def is_stored():
         stored = [path.stat() for path in folder.glob("run/chains.*/chain-*.segment")]
-        return any(file.st_mtime > since and file.st_size > 10_000 for file in stored)
+        return sum(file.st_size for file in stored if file.st_mtime > since) > 10_000
 
     wait_until(is_stored)
 

@@ -3,13 +3,18 @@
 import contextlib
 import io
 import sys
+from types import SimpleNamespace
 
 import pymc as pm
 import pytest
 from pymc.progress_bar import MCMCProgressBarManager
 from rich.console import Console
+from rich.progress import Progress
 
+import pymc_statespace_filters as psf
+from pymc_statespace_filters import progress
 from pymc_statespace_filters.progress import ChainProgress
+from pymc_statespace_filters.sampling.nuts import chains
 from pymc_statespace_filters.sampling.step import DRAM
 
 TUNE, DRAWS = 100, 900
@@ -47,8 +52,6 @@ def test_final_counts_are_reached(progressbar):
 def test_counts_on_the_way():
     """Each chain has its own; draws are counted anew after warm-up; time runs from the start."""
     with ChainProgress(3, DRAWS, TUNE, "split+stats") as bars:
-        bars.begin(0)
-        bars.begin(1)
         bars.update(0, 60, STATS)
         bars.update(1, 100, STATS | {"accept_rate": 0.001})
         bars.update(0, 250, STATS)
@@ -79,7 +82,7 @@ def test_all_is_legible_in_80_columns(progressbar, monkeypatch):
     screen = quiet(bars, width=80)
     with bars:
         for chain in range(2):
-            bars.begin(chain)
+            bars.update(chain, 1, STATS)
         for task in tasks(bars):  # for more than an hour
             task.start_time -= 5000.0
         bars.update(0, 100_000, STATS, seconds=5000.0)
@@ -111,6 +114,59 @@ def test_values_are_legible_in_80_columns_in_the_bar_of_pm_sample():
     assert "0.25" in drawn
     assert drawn.count("0:00:0") == 2
     assert drawn.splitlines()[-2].count("\u2026") == 0
+
+
+@pytest.fixture
+def updates(monkeypatch):
+    """What chains are shown to have made, in order."""
+    update, found = ChainProgress.update, []
+
+    def noted(bars, chain, done, *others):
+        found.append((chain, done, bars._totals[chain]))
+        update(bars, chain, done, *others)
+
+    monkeypatch.setattr(ChainProgress, "update", noted)
+    return found
+
+
+def model():
+    with pm.Model() as model:
+        pm.Normal("mu")
+    return model
+
+
+@pytest.mark.usefixtures("interpreted")
+def test_bars_of_chains_begin_with_the_first_iteration_and_end_with_the_last(updates, capfd):
+    """Not while machine code is compiled; of a draw in four iterations, at the last one."""
+    psf.sample_dram(10, tune=8, thin=4, chains=2, cores=1, model=model(), initvals={})
+    assert min(done for _, done, _ in updates) > 0
+    assert {total for *_, total in updates} == {48}
+    assert {chain: done for chain, done, _ in updates} == {0: 48, 1: 48}
+
+
+@pytest.mark.usefixtures("interpreted")
+def test_bars_of_nuts_end_with_the_last_iteration(updates, monkeypatch, capfd):
+    """nutpie may have said for the last time that 94 % are done."""
+    late = [SimpleNamespace(finished_draws=17, divergences=0)] * 2
+    monkeypatch.setattr(chains._Watch, "__call__", lambda watch, _: setattr(watch, "chains", late))
+    settings = {"sampler": "nuts", "until_ess": None, "initvals": {"mu": 0.5}}
+    psf.sample(10, tune=8, chains=2, model=model(), **settings)
+    assert {chain: done for chain, done, _ in updates} == {0: 18, 1: 18}
+
+
+def test_a_row_that_was_an_estimate_is_whole_at_the_end(monkeypatch):
+    work, shown = SimpleNamespace(on_progress=None), []
+    monkeypatch.setattr(
+        progress, "create_simple_progress", lambda: shown.append(screen()) or shown[-1]
+    )
+    with progress.row_progress(work, enabled=True, patience=0.0) as begin:
+        begin("a part", 100)
+        work.on_progress(94)
+    assert [bar.tasks[0].percentage for bar in shown] == [100.0]
+
+
+def screen():
+    return Progress(console=Console(file=io.StringIO()))
 
 
 @pytest.mark.parametrize("progressbar", FORMS)
@@ -170,7 +226,6 @@ def test_nothing_is_drawn_or_imported_without_a_bar(capfd, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.colors", None)
     monkeypatch.setitem(sys.modules, "marimo", None)
     with ChainProgress(1, DRAWS, TUNE, False) as bars:
-        bars.begin(0)
         bars.update(0, 5, STATS)
         bars.update(0, 1000, STATS)
     assert capfd.readouterr() == ("", "")

@@ -5,7 +5,13 @@ import numpy as np
 import pymc as pm
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.sampling.output.remedies import reaches_zero, ways_to_mix
+from pymc_statespace_filters.sampling.output.convergence import Convergence
+from pymc_statespace_filters.sampling.output.remedies import (
+    alternatives,
+    reaches_zero,
+    ways_to_mix,
+)
+from pymc_statespace_filters.sampling.output.report import mixing_warning
 
 RNG = np.random.default_rng(0)
 NORMAL = RNG.normal(size=4000)
@@ -48,9 +54,13 @@ def test_the_scale_of_others_is_left_out():
 
 def test_the_advice():
     model, names, positions = drawn(abs(NORMAL))
-    assert ways_to_mix(model, names, positions, "other").startswith("or sample stiffness as it is")
+    (way,) = ways_to_mix(model, names, positions, "other")
+    assert way.startswith("sample stiffness as it is, whose logarithm")
+    found = Convergence(np.array([900.0]), np.array([900.0]), np.array([1.02]))
+    warning = mixing_warning(found, ["stiffness"], 400.0, 1000, 1.0, lambda name: [way])
+    assert warning.message.endswith(f"(stiffness). If R-hat stays above 1.01, {way}.")
     model, names, positions = drawn(5 + NORMAL)
-    assert ways_to_mix(model, names, positions, "other") == (
+    assert alternatives(ways_to_mix(model, names, positions, "other")) == (
         "tune longer, use psf.sample(sampler='nuts'), or reparametrise other"
     )
 

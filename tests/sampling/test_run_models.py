@@ -14,6 +14,7 @@ import pytest
 from pytensor.compile.ops import wrap_py
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters import rivals as rivals_module
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.sampling.run import model_result
 from pymc_statespace_filters.sampling.run.model_task import ModelTask
@@ -22,7 +23,7 @@ from pymc_statespace_filters.sampling.run.thread_pool import ChainPool
 from pymc_statespace_filters.sampling.target import target
 from pymc_statespace_filters.sampling.target.settings import RandomWalkSettings
 from tests.interrupts import interrupt, interrupt_chains
-from tests.sampling.test_sample_dram import assert_identical, sample_dram, state_space_model
+from tests.sampling.test_sample_dram import LOGGER, assert_identical, sample_dram, state_space_model
 
 SETTINGS = {"draws": 50, "tune": 50, "chains": 2, "random_seed": 1, "progressbar": False}
 
@@ -223,10 +224,35 @@ def test_particles_of_each_model_as_if_alone(models):
     assert table.loc["wide", "log_evidence"] == trees["wide"].attrs["log_evidence"]
 
 
+def test_samplers_and_arguments_of_sample(caplog):
+    """Of each model as if alone, with its name in all that is said."""
+    rivals = {"narrow": normal_model(), "wide": normal_model(5.0)}
+    settings = {"draws": 30, "tune": 60, "chains": 2, "random_seed": 1}
+    caplog.set_level("INFO")
+    for sampler in ("auto", "nuts"):
+        caplog.clear()
+        trees = psf.run_models(rivals, sampler=sampler, until_ess=50, max_draws=240, **settings)
+        said = [record.message for record in caplog.records if record.name == LOGGER]
+        assert {re.match(r"Model '(\w+)': ", text)[1] for text in said} == set(rivals)
+        assert {tree.attrs["sampler"] for tree in trees.values()} == {
+            sampler.replace("auto", "dram")
+        }
+        if sampler == "auto":
+            alone = psf.sample(until_ess=50, max_draws=240, model=rivals["wide"], **settings)
+            assert_identical(trees["wide"], alone)
+    of_sample = signature(psf.sample).parameters.keys()
+    assert (
+        of_sample - {"model", "sampler", "continue_from", "checkpoint", "comm"}
+        == (rivals_module._SAMPLERS["auto"][1])
+    )
+    with pytest.raises(TypeError, match=r"argument 'thin': .* those of sample, without model"):
+        psf.run_models(rivals, sampler="auto", thin=2)
+
+
 def test_what_particles_do_not_take_is_refused():
     rivals, impossible = {"one": normal_model()}, pm.Model()
-    with pytest.raises(ModelError, match=r"sampler must be one of \('dram', 'smc'\), got 'nuts'"):
-        psf.run_models(rivals, sampler="nuts")
+    with pytest.raises(ModelError, match=r"sampler must be one of .* got 'nutz'"):
+        psf.run_models(rivals, sampler="nutz")
     with pytest.raises(TypeError, match=r"argument 'tune': .* those of sample_smc"):
         psf.run_models(rivals, sampler="smc", tune=10)
     with pytest.raises(ModelError, match="pilot must be None with sampler='smc'"):

@@ -125,6 +125,8 @@ def _followed(
         is_over = _is_finished(sampler)
         if not is_over and (not made or min(made) < request.tune + length.n_iterations):
             continue
+        for i, chain in enumerate(watch.chains):  # which may be what was said before the end
+            bars.update(i, request.tune + length.n_iterations, _shown(chain))
         trace = sampler.inspect()
         positions = _positions(trace)
         rows = slice(length.thin - 1, length.n_iterations, length.thin)

@@ -8,7 +8,7 @@ from pymc.stats.convergence import SamplerWarning, WarningType
 
 from ...parallel.signals import is_interrupted
 from ..output.convergence import MAX_RHAT
-from ..output.remedies import reaches_zero, without_transform
+from ..output.remedies import alternatives, reaches_zero, without_transform
 from ..output.report import until_ess_warning
 from ..output.warnings import sampler_warning
 from ..run.request import SamplingRequest
@@ -35,12 +35,11 @@ def messages_of(
     problems = [*_problems(chains, names, instead), *missed]
     if request.until_ess is not None and not is_enough(request, chains.found):
         slowest = names[0] if chains.found is None else names[int(chains.found.rhat.argmax())]
-        ways = instead or f"use sampler='dram', or reparametrise {slowest}"
+        ways = [instead] if instead else ["use sampler='dram'", f"reparametrise {slowest}"]
         n = chains.length.n_iterations
         if chains.is_stuck:
-            remedy = f"more iterations do not help draws that diverge: {ways}"
+            remedy = f"more iterations do not help draws that diverge: {alternatives(ways)}"
         else:
-            ways = f"or {ways}" if instead else ways
             remedy = remedy_of(request, chains.length, chains.found, chains.seconds, ways)
         arguments = request.until_ess, n, chains.seconds, chains.found, names, remedy
         problems.append(until_ess_warning(*arguments))

@@ -1,6 +1,7 @@
 """A whole run of NUTS, from the request to the DataTree."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from ..output.datatree import to_datatree
 from ..output.filter_check import FilterCheck, check_filters, warn_of_filters
 from ..output.step_check import step_warnings
 from ..output.unvisited import unvisited_warnings
+from ..output.warnings import of_model
 from ..run.request import ExecutionOptions, SamplingRequest
 from ..starts.modes import modes_message, modes_warning
 from ..starts.population import find_population
@@ -33,15 +35,17 @@ Array = NDArray[np.float64]
 
 
 @keeps_what_is_there
-def sample_nuts(model: Model, request: SamplingRequest, options: ExecutionOptions) -> DataTree:
-    """Draw from the posterior by nutpie; errors are those of `sample`."""
+def sample_nuts(
+    model: Model, request: SamplingRequest, options: ExecutionOptions, name: str
+) -> DataTree:
+    """Draw from the posterior by nutpie; errors are those of `sample`, messages have the name."""
     options.check()
     check_no_generators(model)
     _check_initvals(model, request)
     progressbar = options.progressbar
     rng = np.random.default_rng(request.entropy)
     target = Target(model, None, RandomWalkSettings())
-    start = _start(model, target, request, rng, progressbar=bool(progressbar))
+    start = _start(model, target, request, rng, name, progressbar=bool(progressbar))
     chains = run_nuts(
         DensityGradient(model, target.raveled),
         start,
@@ -66,8 +70,9 @@ def sample_nuts(model: Model, request: SamplingRequest, options: ExecutionOption
     level = "info" if progressbar else "debug"
     names = element_names(model, target.raveled.variables)
     messages = messages_of(model, chains, missed, request, names, level)
-    log_warnings([*messages, *check.messages(level)])
-    warn_of_filters(check.warned)
+    said = [*messages, *check.messages(level)]
+    log_warnings([replace(one, message=of_model(name) + one.message) for one in said])
+    warn_of_filters([of_model(name) + text for text in check.warned])
     return tree
 
 
@@ -110,6 +115,7 @@ def _start(
     target: Target,
     request: SamplingRequest,
     rng: np.random.Generator,
+    name: str,
     *,
     progressbar: bool,
 ) -> Callable[[np.random.Generator], Array]:
@@ -125,5 +131,5 @@ def _start(
     target.prepare()
     population = find_population(target, rng, progressbar=progressbar)
     if (message := modes_message(model, target.raveled, population)) is not None:
-        log_warnings([modes_warning(message)])
+        log_warnings([modes_warning(of_model(name) + message)])
     return lambda own: population.x[own.integers(len(population.x))]

@@ -20,21 +20,26 @@ _LEAST_CORRELATION = 0.5  # with another parameter, that can make up for it
 Array = NDArray[np.float64]
 
 
-def ways_to_mix(model: Model, names: Sequence[str], positions: Array, slowest: str) -> str:
+def alternatives(ways: Sequence[str]) -> str:
+    """Things to do, of which one is enough: the end of a sentence."""
+    return ", or ".join([", ".join(ways[:-1]), ways[-1]] if len(ways) > 1 else ways)
+
+
+def ways_to_mix(model: Model, names: Sequence[str], positions: Array, slowest: str) -> list[str]:
     """What works for this model if chains of `sample_dram` are slow along one element.
 
     ``positions`` (n, k) are draws of the elements with these ``names``, unconstrained.
     """
     if (name := reaches_zero(model, names, positions)) is not None:
-        ways = [f"or {without_transform(name)}"]
+        ways = [without_transform(name)]
     else:
         ways = ["tune longer"]
         if not gradient_obstacle(model) and kinked_variable(model) is None:
             ways.append("use psf.sample(sampler='nuts')")
-        ways.append(f"or reparametrise {slowest}")
+        ways.append(f"reparametrise {slowest}")
     if noisy_filters(model):
         ways.insert(-1, "give the filter more particles (psf.suggest_particles)")
-    return ", ".join(ways)
+    return ways
 
 
 def without_transform(name: str) -> str:

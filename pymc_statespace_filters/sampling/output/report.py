@@ -7,6 +7,7 @@ from pymc.stats.convergence import SamplerWarning
 from ...filters.outcomes import Failure
 from .convergence import MAX_RHAT, Convergence
 from .datatree import most_iterations
+from .remedies import alternatives
 from .warnings import PhaseStatistics, sampler_warning
 
 # Effective draws of each chain below which PyMC takes neither diagnostic for reliable.
@@ -39,7 +40,7 @@ def mixing_warning(
     enough: float,
     n_iterations: int,
     seconds: float,
-    ways: Callable[[str], str],
+    ways: Callable[[str], Sequence[str]],
 ) -> SamplerWarning | None:
     """Warn of chains that disagree, or whose draws are worth too little, with what would do.
 
@@ -53,7 +54,8 @@ def mixing_warning(
     if found.least_ess < enough:
         text += f"{needed(found, enough, n_iterations, seconds)} (until_ess={enough:g} does it). "
     if found.rhat.max() > MAX_RHAT:
-        text += f"If R-hat stays above {MAX_RHAT}, {ways(names[int(found.rhat.argmax())])}."
+        remedy = alternatives(ways(names[int(found.rhat.argmax())]))
+        text += f"If R-hat stays above {MAX_RHAT}, {remedy}."
     return sampler_warning(text.strip())
 
 

@@ -202,6 +202,11 @@ def below_known(known: float, chains: Sequence[Draws], tune: int) -> float | Non
     return nats if nats > TOLERATED + chains[0].positions.shape[1] else None
 
 
+def of_model(name: str) -> str:
+    """The beginning of a message about one of several models, which have names."""
+    return f"Model {name!r}: " if name else ""
+
+
 def sampler_warning(message: str) -> SamplerWarning:
     """Make a warning for PyMC's logger."""
     return SamplerWarning(WarningType.BAD_ACCEPTANCE, message, "warn")

@@ -14,6 +14,7 @@ from ..checkpoint.checkpoint import Checkpoint
 from ..kernel.state import ChainState, Draws
 from ..output.convergence import Convergence, convergence
 from ..output.likelihood_variance import is_measured
+from ..output.warnings import of_model
 from ..target.initial_points import chain_candidates
 from ..target.record_target import RecordTarget, target_of
 from ..target.target import Target
@@ -314,4 +315,4 @@ class ModelTask:
 
     def _said(self, message: str) -> str:
         """A message about this model, with its name if there are several."""
-        return f"Model {self.name!r}: {message}" if self.name else message
+        return of_model(self.name) + message

@@ -109,7 +109,8 @@ class _Manager:
         )
         self._workers = set(range(1, comm.size))
         request = tasks[0].request
-        self._bars = ChainProgress(self._n_unfinished, request.draws, request.tune, progressbar)
+        n_draws = request.n_iterations - request.tune
+        self._bars = ChainProgress(self._n_unfinished, n_draws, request.tune, progressbar)
         self._display = ConvergenceDisplay(self._bars, self._n_per_model)
 
     def run(self) -> None:
@@ -137,7 +138,6 @@ class _Manager:
             return None
         number = self._schedule.popleft()
         self._tasks[number // self._n_per_model].start_clock()
-        self._bars.begin(number)
         return number
 
     def _add_result(self, number: int, draws: Draws, state: ChainState) -> None:

@@ -1,11 +1,13 @@
 """When the chains of a model end: after a number of draws, or when these are worth enough."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from ...errors import ModelError
 from ...system.checks import check_count, check_positive
 from ..output.convergence import FEWEST, MAX_RHAT, Convergence
+from ..output.remedies import alternatives
 from ..output.report import needed
 from .request import SamplingRequest
 
@@ -94,7 +96,7 @@ def remedy_of(
     length: Length,
     found: Convergence | None,
     seconds: float,
-    ways: str,
+    ways: Sequence[str],
 ) -> str:
     """What to do if chains ended before their draws were worth enough; ``ways`` make them mix."""
     enough = request.until_ess or 0.0
@@ -102,10 +104,11 @@ def remedy_of(
         return f"give more draws: {request.chains} * {request.draws} hardly show so many"
     would_do = "" if found is None else f"{needed(found, enough, length.n_iterations, seconds)}; "
     if not request.doubles_thin:
-        return f"{would_do}give a larger max_draws, {ways}"
+        return would_do + alternatives(["give a larger max_draws", *ways])
     if 2 * length.n_iterations > (request.max_draws or 0):
-        return f"{would_do}give a larger max_draws than {request.max_draws}, {ways}"
+        return would_do + alternatives([f"give a larger max_draws than {request.max_draws}", *ways])
+    more = alternatives(["make more with psf.sample(continue_from=idata)", *ways])
     return (
         f"{would_do}the run ended as twice as many would take longer than its "
-        f"{request.seconds:.0f} s: make more with psf.sample(continue_from=idata), {ways}"
+        f"{request.seconds:.0f} s: {more}"
     )
