@@ -20,7 +20,7 @@ N_COLORS = 8  # that every backend tells apart
 BOUND = "ci_bound"
 PANELS_IN_LINE = 4
 TITLE_WIDTH, TITLE_SIZE = 36, 10  # of a line in letters, and of a letter in points
-LONGEST_NAME = 24  # in letters, of an axis
+LONGEST_NAME, INCHES_PER_LETTER = 24, 0.08  # in letters, of an axis
 # Of an axis, at most: between them labels of years have room.
 N_TICKS, TICKS_PER_INCH = 8, 1.4
 
@@ -229,15 +229,16 @@ def canvas_of_rows(
     """Make a figure with one labelled row per entry of the only dimension, the first on top."""
     (dim,) = map(str, data.dims)
     places = np.arange(data.sizes[dim])[::-1]
+    names = [str(name) for name in data[dim].values]
+    for_names = INCHES_PER_LETTER * max(0, max(map(len, names), default=0) - LONGEST_NAME)
     collection = canvas(
         data,
         backend=backend,
         pc_kwargs=pc_kwargs,
         aes={"y": [dim]},
-        size=(6.4, 1.3 + 0.6 * len(places)),
+        size=(6.4 + for_names, 1.3 + 0.6 * len(places)),
         y=places,
     )
-    names = [str(name) for name in data[dim].values]
     collection.map(label_rows, ignore_aes="all", places=places, names=names, store_artist=False)
     return collection
 

@@ -41,7 +41,7 @@ N_SIMULATIONS = 1000  # of uniform numbers, for the simultaneous band of their E
 SEEN = {"color": "C0"}
 EXPECTED = {"color": "B3", "alpha": 0.3}
 CORRELATIONS = {"autocorrelation", "inputs"}  # drawn as bars over lags
-CUT = {"color": "C1"}
+CUT = {"color": "C1", "marker": "C3"}
 LIMIT = {"color": "B1", "linestyle": "C1"}
 
 
@@ -228,7 +228,7 @@ def _mark_clipped(
     if clipped is None or not clipped.any():
         return {}
     cut = residual.where(rename_last_dims(clipped, "time", "observable"))
-    collection.map(points, "clipped", data=cut, diameter=6, marker="C3", **CUT)
+    collection.map(points, "clipped", data=cut, diameter=6, **CUT)
     return {"further out": legend_style(CUT)}
 
 

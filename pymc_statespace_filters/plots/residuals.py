@@ -238,11 +238,11 @@ def _label_panels(
     """Label the axes of each panel, and the columns if there are several."""
     settings: dict[str, Any] = {"ignore_aes": "all", "store_artist": False}
     for row in map(str, panels):
-        data, lag = panels[[row]], "lag (observations)"
+        data = panels[[row]]
         x_label, y_label = {
             "innovation": (time, "standardised innovation"),
-            "autocorrelation": (lag, "autocorrelation"),
-        }.get(row, (lag, f"correlation with {row.removeprefix('input_')}"))
+            "autocorrelation": ("lag (observations)", "autocorrelation"),
+        }.get(row, (f"lag of {row.removeprefix('input_')} (observations)", "correlation"))
         if row == "prediction":
             y_label = "standardised innovation"
             texts = panels["observable"].copy(data=predicted)

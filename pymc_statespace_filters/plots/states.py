@@ -101,10 +101,10 @@ def plot_states(
         Number of draws to show beside the bands: as lines for smoothed states at every step, as
         points for filtered states and for states at observation times only.
     transform : callable or mapping of str to callable, optional
-        Function of an array that is applied to the states, the truth, and the observables with
-        names of states before they are drawn: ``numpy.exp`` shows the abundance if the state is its
-        logarithm. Observables with other names are drawn as they are. A mapping from names of
-        states and observables gives each its function.
+        Function of an array that is applied to the states, the truth, and the observables that are
+        states by default before they are drawn: ``numpy.exp`` shows the abundance if the state is
+        its logarithm. Others, such as those of ``observables``, are drawn as they are. A mapping
+        from names of states and observables gives each its function.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
         Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
@@ -152,6 +152,9 @@ def plot_states(
     record, measured = _record(idata, name, observables, draws, facets)
     seen = [] if record is None else [str(one) for one in record["observable"].values]
     functions = functions_of(transform, all_states, seen)
+    if observables is None:  # what is a state is drawn as that state
+        of_state = {one: functions[state] for state, one in measured.items() if state in functions}
+        functions = of_state | dict(functions)
     true = None if truth is None else _truth(truth, draws, functions, shown)
 
     data = transformed(draws.sel(state=shown), "state", functions).to_dataset(name="states")

@@ -84,12 +84,11 @@ def test_one_column_of_labelled_panels_for_each_observable(diagnostics_with_inpu
     left, right = axes[::2], axes[1::2]
     assert [len({one.get_position().x0 for one in column}) for column in (left, right)] == [1, 1]
     assert (left[0].get_title(), right[0].get_title()) == ("position", "speed")
-    lag = "lag (observations)"
     assert [(one.get_xlabel(), one.get_ylabel()) for one in right] == [
         ("time (s)", "standardised innovation"),
-        (lag, "autocorrelation"),
-        (lag, "correlation with force"),
-        (lag, "correlation with heat"),
+        ("lag (observations)", "autocorrelation"),
+        ("lag of force (observations)", "correlation"),
+        ("lag of heat (observations)", "correlation"),
         ("predicted speed (m/s)", "standardised innovation"),
     ]
 

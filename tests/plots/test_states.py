@@ -365,5 +365,7 @@ def test_data_are_in_the_panel_of_the_state_that_their_sensor_is(states):
     data = drawn(plot_states(tree, backend="none"), "data")
     assert data["position"] is None
     np.testing.assert_allclose(data["speed"]["y"], np.delete(SINE[::5], 3))
+    squares = drawn(plot_states(tree, transform=np.square, backend="none"), "data")
+    np.testing.assert_allclose(squares["speed"]["y"], np.delete(SINE[::5], 3) ** 2)
     chosen = plot_states(tree, observables={"position": "y"}, backend="none")
     assert drawn(chosen, "data")["speed"] is None
