@@ -149,6 +149,17 @@ def test_a_key_of_long_names_is_inside_the_figure(backend):
         assert key.ncols * (key.glyph_width + 5 * longest) <= panel.width
 
 
+@pytest.mark.parametrize("plot", [plot_evidence, plot_model_probabilities])
+def test_long_names_of_rows_leave_the_axis_its_label(plot, table):
+    names = {name: f"{long} with hysteresis" for name, long in LONG.items()}
+    figure = plot(table.rename(index=names)).viz["figure"].item()
+    figure.canvas.draw()
+    (axes,) = figure.axes
+    label = axes.xaxis.label.get_window_extent()
+    assert figure.bbox.x0 <= label.x0 < label.x1 <= figure.bbox.x1
+    assert axes.bbox.width > 0.45 * figure.bbox.width
+
+
 @pytest.mark.parametrize("backend", ["plotly", "bokeh"])
 def test_a_short_key_is_one_line(backend, states):
     collection = plot_states(states, backend=backend)

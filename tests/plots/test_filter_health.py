@@ -110,6 +110,8 @@ def test_residuals_that_are_cut_off_are_crossed_out():
     clipped = np.array([[False], [True], [True], [False]])
     group["d_clipped"] = (("d_time", "observable"), clipped)
     tree = xr.DataTree.from_dict({"filter_diagnostics": group})
+    (key,) = plot_filter_health(tree).viz["figure"].item().legends
+    assert key.get_lines()[-1].get_marker() == "x"
     crosses = drawn(plot_filter_health(tree, backend="none"), "clipped", "residual")["y"]
     np.testing.assert_array_equal(crosses["x"], [1, 2])
     np.testing.assert_array_equal(crosses["y"], [2.8, -2.8])
