@@ -24,6 +24,7 @@ from ..ops.states import TermHealth
 from ..system.input_columns import times_of_steps
 from ..system.model import StateSpaceModel
 from ..system.parameters import element_names
+from ..system.readers import counts
 
 type Arguments = tuple[Any, ...]
 
@@ -57,7 +58,7 @@ def warn_about(
         of_records = _named(labels, of_each, here)
         sentences = (
             f"{short_form(filter)} gave -inf{share}{of_records}{place}: {failure.message}",
-            *_cures(system, filter, failure, arguments),
+            *_cures(system, filter, failure, arguments, health[first, 2]),
         )
         warnings.warn(f"{'. '.join(sentences)}.", FilterWarning, skip_file_prefixes=INSIDE)
     smallest = np.where(failed, np.inf, health[:, 0])
@@ -102,7 +103,7 @@ def _place(
 
 
 def _cures(
-    system: StateSpaceModel, filter: Any, failure: Failure, arguments: Arguments
+    system: StateSpaceModel, filter: Any, failure: Failure, arguments: Arguments, row: float
 ) -> list[str]:
     """What to do, for this system where that depends on it.
 
@@ -116,12 +117,22 @@ def _cures(
         ]
     if failure == Failure.STATE_NOT_FINITE and (outside := _outside(system, arguments[0])):
         return [outside]
+    if failure == Failure.ZERO_DENSITY and (fraction := _fraction(system, arguments[2][int(row)])):
+        return [fraction]
     cures = [failure.cure] if failure.cure else []
     if failure == Failure.ZERO_DENSITY and filter.noisy and not compiled.is_deterministic:
         exact = exact_filter(compiled, without=filter)
         if exact is None or np.isfinite(_terms(system, exact, arguments)).all():
             cures.append(elsewhere(compiled, filter).removesuffix("."))
     return cures
+
+
+def _fraction(system: StateSpaceModel, datum: np.ndarray) -> str | None:
+    """Say that an observation (p,) has a fraction where it is a count; None if it has none."""
+    for name, value, is_count in zip(system.observables, datum, counts(system), strict=True):
+        if is_count and value != np.round(value) and not np.isnan(value):
+            return f"{name} = {value:.6g} is no whole number, and its distribution is of counts"
+    return None
 
 
 def _outside(system: StateSpaceModel, theta: np.ndarray) -> str | None:

@@ -135,11 +135,13 @@ class GridFilter:
                 "has none"
             )
         if not system.has_additive_process_noise:
+            remedy = "where noise multiplies a positive x, as in x * exp(q), make log(x) the state"
+            if getattr(system.model.integrator, "substeps", 1) > 1:
+                remedy = "substeps do that: a smaller dt does without them"
             raise ModelError(
                 "GridFilter needs a transition with additive noise, g(x, q) = g(x, 0) + G(x) q, so "
                 "that a step is Gaussian given the state, and here dg/dq depends on q (or cannot "
-                "be seen not to). Substeps of an integrator do that where the drift is not linear: "
-                "a smaller dt does without them"
+                f"be seen not to); {remedy}"
             )
 
     def _tolerance_for(self, system: System) -> float:

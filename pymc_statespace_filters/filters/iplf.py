@@ -136,6 +136,8 @@ class PosteriorLinearization(SigmaPoints):
             line = self.regress(moments, centre, root)
             jac = posterior.by_prior(line.jac)
             observation = seen(datum, line._replace(mean=line.mean - jac @ posterior.mean, jac=jac))
+            if not system.gaussian_observation:
+                observation = _without_certain(observation)
             posterior = _posterior(observation)
         term = self._log_density(system, values, state, posterior)
         return observation._replace(term=term)
@@ -158,7 +160,19 @@ class PosteriorLinearization(SigmaPoints):
         terms = log_p - 0.5 * pt.sum(xi**2, axis=1)
         terms = terms[first:] + (np.log(weights[first:]) + 0.5 * squares[first:])
         largest = disconnected_grad(pt.max(terms))
-        return largest + pt.log(pt.sum(pt.exp(terms - largest))) + posterior.log_det
+        unit = pt.switch(pt.eq(largest, -np.inf), 0.0, largest)
+        return unit + pt.log(pt.sum(pt.exp(terms - unit))) + posterior.log_det
+
+
+def _without_certain(observation: Seen) -> Seen:
+    """The observation with a unit variance where it has none, as a count of mean zero has.
+
+    Such a number is the same at all states, and says nothing of them.
+    """
+    variances = pt.diagonal(observation.noise_cov)
+    is_certain = pt.eq(variances, 0.0) & pt.all(pt.eq(observation.jac, 0.0), axis=1)
+    unit = pt.diag(pt.cast(is_certain, "float64"))
+    return observation._replace(noise_cov=observation.noise_cov + unit)
 
 
 def _posterior(observation: Seen) -> _Posterior:

@@ -219,4 +219,8 @@ def date_index(name: str, dates: Any) -> pd.DatetimeIndex:
             "ns"
         )
     except (TypeError, ValueError, OverflowError) as error:
-        raise ModelError(f"{name} must be dates from 1678 to 2261, got {error}") from None
+        raise ModelError(
+            f"{name} must be dates from 1678 to 2261, got {error}; give others as numbers, such as "
+            "the days (dates - dates[0]) / np.timedelta64(1, 'D') of dates = np.array(..., "
+            "'datetime64[D]')"
+        ) from None

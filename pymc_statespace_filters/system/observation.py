@@ -4,12 +4,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import pymc as pm
+import pytensor.scalar as ps
 import pytensor.tensor as pt
 from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Variable
 from pytensor.graph.fg import FrozenFunctionGraph
-from pytensor.graph.traversal import graph_inputs
+from pytensor.graph.replace import graph_replace
+from pytensor.graph.traversal import graph_inputs, io_toposort
+from pytensor.tensor.elemwise import Elemwise
 from pytensor.tensor.random.type import RandomType
 from pytensor.tensor.variable import TensorVariable
 
@@ -202,6 +206,17 @@ def _trace_distributions(
     )
 
 
+def _with_slope_at_zero(logp: TensorVariable) -> TensorVariable:
+    """The same, with a derivative where the mean of a count is zero: its logarithm has none."""
+    logs = {}
+    for node in io_toposort([], [logp]):
+        if isinstance(node.op, Elemwise) and isinstance(node.op.scalar_op, ps.Log):
+            (x,) = node.inputs
+            is_zero = pt.eq(x, 0.0)
+            logs[node.outputs[0]] = pt.switch(is_zero, -np.inf, pt.log(pt.switch(is_zero, 1.0, x)))
+    return graph_replace([logp], logs, strict=False)[0] if logs else logp
+
+
 def _log_density(variable: Any, value: TensorVariable) -> TensorVariable:
     """The log-density of one component, 0 where it is missing: it is independent of the others."""
     if not isinstance(variable, TensorVariable) or variable.type.ndim != 0:
@@ -218,6 +233,7 @@ def _log_density(variable: Any, value: TensorVariable) -> TensorVariable:
         if "int" in variable.type.dtype:
             # A value that is not an integer has probability zero.
             whole = pm.logp(variable, pt.cast(pt.round(value), variable.type.dtype))
+            whole = _with_slope_at_zero(whole)
             there = pt.switch(pt.eq(value, pt.round(value)), whole, -float("inf"))
         else:
             there = pm.logp(variable, value)

@@ -31,6 +31,16 @@ def observables_that_read(system: "StateSpaceModel", states: Sequence[int]) -> n
     return np.where(found.any(axis=0), found, True).astype(np.int64)
 
 
+def counts(system: "StateSpaceModel") -> list[bool]:
+    """Which observables have a distribution of whole numbers."""
+    graph = system.equations.observation_draw
+    if graph is None:
+        return [False] * system.p
+    (whole,) = graph.outputs
+    drawn = [element.owner.inputs[0] for element in whole.owner.inputs if element.owner.inputs]
+    return ["int" in getattr(variable.type, "dtype", "") for variable in drawn]
+
+
 def _change(system: "StateSpaceModel", state: int) -> np.ndarray:
     """Which observables (p,) change with a state, at some random points."""
     inputs, parts = _parts(system)

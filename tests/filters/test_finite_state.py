@@ -8,6 +8,7 @@ import pytensor.tensor as pt
 import pytest
 import xarray as xr
 from numba import njit
+from scipy.linalg import expm
 from scipy.stats import norm, poisson
 
 import pymc_statespace_filters as psf
@@ -507,3 +508,36 @@ def test_it_is_recommended_where_another_filter_refuses():
         psf.log_likelihood(WEAR, psf.GridFilter(), WORN, **COUNTS)
     found = exact_filter(compile_system(WEAR), without=psf.BootstrapPF(100))
     assert found == psf.FiniteStateFilter()
+
+
+def test_a_chain_in_continuous_time_at_uneven_gaps():
+    """Probabilities of a matrix exponential, by that of SciPy; and their gradient."""
+    gaps, data = np.array([0.1, 5.0, 0.7]), np.array([0.1, 0.9, 1.2, -0.1])
+
+    def law(x, u, a):
+        generator = pt.stack([pt.stack([-a, a]), pt.stack([0.7 * a, -0.7 * a])])
+        return [pm.Categorical.dist(p=pt.linalg.expm(generator * u[0])[pt.cast(x[0], "int64")])]
+
+    system = psf.StateSpaceModel(
+        transition=lambda x, q: [q[0]], process_dist=law, observation=lambda x: [x[0]],
+        observation_noise=[[0.25]], initial_dist=lambda: [pm.Bernoulli.dist(0.4)], inputs=["gap"],
+    )  # fmt: skip
+
+    def exact(a):
+        total, weights = 0.0, np.array([0.6, 0.4])
+        for j, d in enumerate(data):
+            if j:
+                weights = weights @ expm(a * gaps[j - 1] * np.array([[-1.0, 1.0], [0.7, -0.7]]))
+            weights = weights * norm.pdf(d, [0.0, 1.0], 0.5)
+            total, weights = total + np.log(weights.sum()), weights / weights.sum()
+        return total
+
+    with pm.Model() as model:
+        pm.Flat("a")
+        psf.StateSpace("d", system, psf.FiniteStateFilter(), steps=range(4), observed=data,
+                       inputs=gaps)  # fmt: skip
+    logp, slope = model.compile_logp(), model.compile_dlogp()
+    np.testing.assert_allclose(logp({"a": 1.3}), exact(1.3), rtol=1e-12)
+    difference = (exact(1.3 + 1e-5) - exact(1.3 - 1e-5)) / 2e-5
+    np.testing.assert_allclose(slope({"a": 1.3}), difference, rtol=1e-7)
+    assert psf.FiniteStateFilter().is_smooth_for(compile_system(system))

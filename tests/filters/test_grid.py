@@ -318,6 +318,9 @@ def test_systems_that_it_cannot_treat_are_refused_with_advice():
     assert "BootstrapPF" in message
     substeps = psf.EulerMaruyama(lambda x: [-(x[0] ** 3)], [[1.0]], dt=0.1, substeps=2)
     assert "smaller dt" in refused(transition=substeps, process_noise=None)
+    multiplied = refused(transition=lambda x, q: [0.9 * x[0] * pt.exp(q[0])])
+    assert "substeps" not in multiplied
+    assert "as in x * exp(q), make log(x) the state" in multiplied
 
 
 def test_in_a_model_it_is_a_deterministic_likelihood_for_dram():

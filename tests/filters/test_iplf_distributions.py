@@ -190,3 +190,39 @@ def test_distributions_outside_the_table_are_named():
         psf.errors.ModelError, match=r"which it knows for Bernoulli, .*; got cauchy"
     ):
         psf.log_likelihood(system, psf.IPLF(), {}, [3.0], steps=[0])
+
+
+@pytest.mark.parametrize("law", ["Poisson", "Binomial"])
+def test_counts_whose_mean_is_zero_say_nothing(law):
+    """At night, where the mean is zero at every state: 0 nats, as those of a missing row."""
+
+    def seen(x, u):
+        mean = u[0] * pt.exp(x[0] - 1.0)
+        return [pm.Poisson.dist(mean) if law == "Poisson" else pm.Binomial.dist(10, 0.2 * mean)]
+
+    system = psf.StateSpaceModel(
+        lambda x, q, a: [a * x[0] + q[0]], process_noise=[[0.1]], observation_dist=seen,
+        initial_mean=[0.0], initial_cov=[[0.1]], inputs=["day"],
+    )  # fmt: skip
+    given = {"steps": range(4), "inputs": np.array([0.0, 1.0, 1.0, 0.0])}
+    zero, missing = (
+        psf.log_likelihood(system, psf.IPLF(), {"a": 0.9}, [night, 0.0, 1.0, night], **given)
+        for night in (0.0, np.nan)
+    )
+    np.testing.assert_allclose(zero, missing, atol=1e-14)
+    with pm.Model() as model:
+        pm.Normal("a")
+        psf.StateSpace("d", system, psf.IPLF(), observed=[0.0, 0.0, 1.0, 0.0], **given)
+    logp, slope = model.compile_logp(), model.compile_dlogp()
+    difference = (logp({"a": 0.9 + 1e-5}) - logp({"a": 0.9 - 1e-5})) / 2e-5
+    np.testing.assert_allclose(slope({"a": 0.9}), difference, rtol=1e-6)
+    with pytest.warns(psf.errors.FilterWarning, match="has density zero wherever this filter"):
+        psf.log_likelihood(system, psf.IPLF(), {"a": 0.9}, [1.0, 0.0, 1.0, 0.0], **given)
+
+
+def test_a_fraction_among_counts_is_named():
+    system = counts()
+    params = dict.fromkeys(system.parameters, 0.5)
+    for filter in (psf.IPLF(), psf.BootstrapPF(100)):
+        with pytest.warns(psf.errors.FilterWarning, match=r"y0 = 1.5 is no whole number, and its"):
+            psf.log_likelihood(system, filter, params, [2.0, 1.5, 3.0], steps=[0, 1, 2])

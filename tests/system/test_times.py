@@ -489,3 +489,21 @@ def test_a_run_goes_on_as_one_run(filter, times):
         later = pd.DatetimeIndex(DATES[9:], tz="Europe/Paris")
         with pytest.raises(ModelError, match="times must have no time zone"):
             psf.run_filter(EXACT, filter, THETA, DATA[9:], times=later, state=first, unit="D")
+
+
+@pytest.mark.parametrize("kind", ["datetime64[D]", "datetime64[s]", object])
+def test_dates_before_1678_may_be_numbers(kind):
+    """The error says how: by its own call, the days since the first."""
+    days = np.array(["1601-01-01", "1601-01-03"], "datetime64[D]")
+    given = days.astype(kind)
+    system = psf.StateSpaceModel(
+        psf.EulerMaruyama(lambda x, a: [-a * x[0]], [[0.3]], dt=0.5), observation=lambda x: [x[0]],
+        observation_noise=[[0.1]], initial_mean=[1.0], initial_cov=[[0.1]],
+    )  # fmt: skip
+    with pytest.raises(ModelError, match="dates from 1678 to 2261") as refusal:
+        psf.log_likelihood(system, psf.EKF(), {"a": 0.1}, [1.0, 0.9], times=given, unit="D")
+    call = str(refusal.value).split("the days ")[1].split(" of dates")[0]
+    times = eval(call, {"np": np, "dates": np.array(given, "datetime64[D]")})
+    terms = psf.log_likelihood(system, psf.EKF(), {"a": 0.1}, [1.0, 0.9], times=times)
+    by_steps = psf.log_likelihood(system, psf.EKF(), {"a": 0.1}, [1.0, 0.9], steps=[0, 4])
+    np.testing.assert_array_equal(terms, by_steps)

@@ -22,6 +22,7 @@ from pytensor.link.numba.dispatch.basic import (
     register_funcify_and_cache_key,
 )
 from pytensor.tensor.linalg.decomposition.cholesky import Cholesky
+from pytensor.tensor.linalg.products import Expm
 from pytensor.tensor.linalg.solvers.psd import CholeskySolve
 from pytensor.tensor.linalg.solvers.triangular import SolveTriangular
 from pytensor.tensor.math import Dot
@@ -219,7 +220,37 @@ def solve_upper(a, b):
     return out
 
 
-_LOOPS = {f.py_func.__name__: f for f in (product, cholesky, solve_lower, solve_upper)}
+_N_TERMS, _LARGEST_NORM, _MAX_DOUBLINGS = 14, 0.25, 60  # the next term is below rounding
+
+
+@numba_njit
+def exponential(a):
+    """The matrix exponential, by its series for a part of ``a`` that is squared again and again."""
+    n, norm, doublings = a.shape[0], 0.0, 0
+    for i in range(n):
+        total = 0.0
+        for j in range(n):
+            total += abs(a[i, j])
+        norm = total if not total <= norm else norm
+    while norm > _LARGEST_NORM and doublings < _MAX_DOUBLINGS:
+        norm *= 0.5
+        doublings += 1
+    part, out = np.empty((n, n)), np.eye(n)
+    for i in range(n):
+        for j in range(n):
+            part[i, j] = a[i, j] * 0.5**doublings
+    for m in range(_N_TERMS, 0, -1):
+        out = product(part, out)
+        for i in range(n):
+            for j in range(n):
+                out[i, j] = out[i, j] / m + (i == j)
+    for _ in range(doublings):
+        out = product(out, out)
+    return out
+
+
+_FUNCTIONS = (product, cholesky, solve_lower, solve_upper, exponential)
+_LOOPS = {f.py_func.__name__: f for f in _FUNCTIONS}
 
 
 class Loops(Op):
@@ -244,7 +275,7 @@ def _numba_loops(op: Loops, node: Apply | None = None, **kwargs) -> tuple:
 
 
 def use_loops(graph: FunctionGraph) -> None:
-    """Replace, in place, the products, Cholesky factors and triangular solves of a graph."""
+    """Replace, in place, the products, exponentials, Cholesky factors and triangular solves."""
     for node in graph.toposort():
         # Slices and the like have no number type.
         kinds = {getattr(v.type, "dtype", None) for v in (*node.inputs, *node.outputs)}
@@ -258,6 +289,8 @@ def _written_in_loops(node: Apply) -> Variable | None:
     op, first, last = node.op, node.inputs[0], node.inputs[-1]
     if isinstance(op, Dot):
         return Loops("product")(first, last)
+    if isinstance(op, Expm):
+        return Loops("exponential")(first)
     if isinstance(op, Cholesky):
         return Loops("cholesky")(first) if op.lower else Loops("cholesky")(first.T).T
     if isinstance(op, SolveTriangular) and not op.unit_diagonal:

@@ -9,6 +9,7 @@ import operator
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from functools import reduce
+from typing import Any
 
 import numpy as np
 import pytensor.scalar as ps
@@ -22,10 +23,20 @@ FLOAT, INTEGER, BOOLEAN = "f", "i", "b"
 class Expression:
     """One scalar: an input (``op`` is None, ``args`` its name) or an operation on other scalars."""
 
-    op: ps.ScalarOp | None
+    op: Any
     args: tuple
     kind: str
     number: int
+
+
+class Opaque:
+    """An operation on arrays: an element of its result is not written out, but what it depends on.
+
+    Expressions of it are for questions; no code is made of them.
+    """
+
+    def __init__(self, op: object) -> None:
+        self.op = op
 
 
 _COMPARISONS = (ps.LT, ps.GT, ps.LE, ps.GE, ps.EQ, ps.NEQ, ps.IsNan, ps.IsInf)
@@ -91,7 +102,11 @@ class Arena:
         same = kind_of(simplified) == kind
         return simplified if same else self.apply(_CASTS[kind], simplified)
 
-    def _intern(self, op: ps.ScalarOp | None, args: tuple, kind: str) -> Expression:
+    def opaque(self, op: Opaque, args: tuple, element: int) -> Expression:
+        """An element of the result of an operation that is not written out."""
+        return self._intern(op, (*args, element), FLOAT)
+
+    def _intern(self, op: ps.ScalarOp | Opaque | None, args: tuple, kind: str) -> Expression:
         key = (op, kind, *((a.number if isinstance(a, Expression) else (type(a), repr(a)))
                            for a in args))  # fmt: skip
         if key not in self._interned:

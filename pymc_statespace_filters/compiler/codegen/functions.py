@@ -50,8 +50,8 @@ LARGE = 1000
 LARGE_TUPLE = 400
 
 
-def unrolled(graph: Graph) -> list[list[Value]]:
-    """The elements of every output as scalar expressions."""
+def unrolled(graph: Graph, *, to_ask: bool = False) -> list[list[Value]]:
+    """The elements of every output as scalar expressions, see `unroll`."""
     size = sum(np.prod(output.type.shape or (1,)) for output in graph.outputs)
     if size > MAX_OUTPUT_ELEMENTS:
         raise NotUnrollableError(f"more than {MAX_OUTPUT_ELEMENTS} numbers")
@@ -60,7 +60,7 @@ def unrolled(graph: Graph) -> list[list[Value]]:
     inputs = list(graph.inputs.values())
     n_nodes = len(io_toposort(inputs, graph.outputs))
     most = int(MAX_EXPRESSIONS * max(1.0, n_nodes / MANY_NODES))
-    arrays = unroll(arena, inputs, values, graph.outputs, TRIED * most)
+    arrays = unroll(arena, inputs, values, graph.outputs, TRIED * most, to_ask=to_ask)
     lists = [list(np.atleast_1d(a)) for a in arrays]
     if n_operations(v for group in lists for v in group) > most:
         raise NotUnrollableError(f"more than {most} scalar operations")

@@ -16,6 +16,7 @@ from pytensor.assumptions.specify import SpecifyAssumptions
 from pytensor.compile.builders import OpFromGraph
 from pytensor.compile.ops import DeepCopyOp, ViewOp
 from pytensor.graph.basic import Constant, Variable
+from pytensor.graph.op import Op
 from pytensor.graph.traversal import io_toposort
 from pytensor.raise_op import CheckAndRaise
 from pytensor.tensor.blockwise import Blockwise
@@ -37,7 +38,7 @@ from pytensor.tensor.subtensor import (
     unflatten_index_variables,
 )
 
-from .expressions import Arena, Value, is_constant, plain
+from .expressions import Arena, Opaque, Value, is_constant, plain
 from .scalar_linalg import (
     cholesky,
     cholesky_solve,
@@ -60,16 +61,47 @@ def unroll(
     values: Sequence[np.ndarray],
     outputs: Sequence[Variable],
     max_expressions: int,
+    *,
+    to_ask: bool = False,
 ) -> list[np.ndarray]:
-    """Object arrays of scalar expressions for ``outputs``, given those for ``inputs``."""
+    """Object arrays of scalar expressions for ``outputs``, given those for ``inputs``.
+
+    If they are only ``to_ask`` what depends on what, linear algebra need not have a scalar form.
+    """
     known: dict[Variable, np.ndarray] = dict(zip(inputs, values, strict=True))
     for node in io_toposort(inputs, outputs):
         arguments = [_value(known, variable) for variable in node.inputs]
-        results = evaluate(arena, node, arguments)
+        try:
+            results = evaluate(arena, node, arguments)
+        except NotUnrollableError:
+            if not (to_ask and is_linear_algebra(node.op)):
+                raise
+            results = _opaque(arena, node, arguments)
         known.update(zip(node.outputs, map(objects, results), strict=True))
         if len(arena) > max_expressions:
             raise NotUnrollableError(f"more than {max_expressions} scalar operations")
     return [_value(known, variable) for variable in outputs]
+
+
+def is_linear_algebra(op: Op) -> bool:
+    """Whether an operation is one of PyTensor's linear algebra, beyond a product."""
+    core = op.core_op if isinstance(op, Blockwise) else op
+    of_pytensor = type(core).__module__.startswith("pytensor.tensor.linalg")
+    return of_pytensor and not isinstance(core, Dot)
+
+
+def _opaque(arena: Arena, node, arguments: list[np.ndarray]) -> list[np.ndarray]:
+    """Results of an operation that is not written out, of all elements of its arguments."""
+    op, given = Opaque(node.op), tuple(v for array in arguments for v in array.flat)
+    results = []
+    for i, output in enumerate(node.outputs):
+        if None in output.type.shape:
+            raise NotUnrollableError(f"the operation {node.op}")
+        result = np.empty(output.type.shape, dtype=object)
+        for element, index in enumerate(np.ndindex(result.shape)):
+            result[index] = arena.opaque(op, (*given, i), element)
+        results.append(result)
+    return results
 
 
 def _value(known: dict[Variable, np.ndarray], variable: Variable) -> np.ndarray:

@@ -20,12 +20,11 @@ from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.graph.op import Op
 from pytensor.graph.replace import graph_replace
 from pytensor.graph.traversal import io_toposort
-from pytensor.tensor.blockwise import Blockwise
-from pytensor.tensor.math import Dot
 from pytensor.tensor.variable import TensorVariable
 
 from ...system.model import StateSpaceModel
 from ..codegen.function_types import ParameterFunction
+from ..codegen.scalarize import is_linear_algebra
 from ..native.entry_point import F64_PTR, EntryPoint
 from ..numerics.small_cholesky import covariance_root
 from .staged import ENTRY_POINTS, staged
@@ -117,9 +116,7 @@ def _constants(
 
 
 def _is_linear_algebra(op: Op) -> bool:
-    core = op.core_op if isinstance(op, Blockwise) else op
-    of_pytensor = type(core).__module__.startswith("pytensor.tensor.linalg")
-    return type(core) in ENTRY_POINTS or (of_pytensor and not isinstance(core, Dot))
+    return type(op) in ENTRY_POINTS or is_linear_algebra(op)
 
 
 def _size(variable: TensorVariable) -> int:

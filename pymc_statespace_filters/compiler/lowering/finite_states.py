@@ -225,7 +225,7 @@ class Given:
     ) -> None:
         self.n, self.n_v = n, symbols["v"].type.shape[0] or 0
         try:
-            (values,) = unrolled(Graph(symbols, [output]))
+            (values,) = unrolled(Graph(symbols, [output]), to_ask=True)
         except NotUnrollableError as reason:
             values, self.reason = [], str(reason)
         self.values: list[Value] = values

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytensor.scalar as ps
 
-from ..codegen.expressions import Expression, Value, in_order
+from ..codegen.expressions import Expression, Opaque, Value, in_order
 
 
 class Known(NamedTuple):
@@ -46,7 +46,9 @@ def known_values(
     return [look_up(value) for value in values]
 
 
-def _applied(op: ps.ScalarOp, arguments: list[Known], size: int) -> Known:
+def _applied(op: ps.ScalarOp | Opaque, arguments: list[Known], size: int) -> Known:
+    if isinstance(op, Opaque):
+        return Known(np.zeros(size), np.zeros(size, bool))
     if isinstance(op, ps.Switch):
         return _chosen(*arguments)
     all_known = np.logical_and.reduce([a.is_known for a in arguments])

@@ -145,7 +145,7 @@ def is_smooth_in_parameters(model: StateSpaceModel) -> bool:
     if model.equations.observation is not None:
         graphs.append(Graph(symbols, [call(model.equations.observation, model, symbols)]))
     try:
-        values = [value for graph in graphs for value in unrolled(graph)[0]]
+        values = [value for graph in graphs for value in unrolled(graph, to_ask=True)[0]]
     except NotUnrollableError:
         return False
     theta = frozenset(f"theta.{i}" for i in range(model.n_theta))
