@@ -90,7 +90,10 @@ class StudentMixture:
         there = replace(self, means=self.means[:, given], chols=np.linalg.cholesky(marginal))
         log_weights = there.log_joint(values[None])[:, 0]
         weights = np.exp(log_weights - logsumexp(log_weights))
-        return replace(self, weights=weights, means=means, chols=_factors(left))
+        # The units of coordinates may differ by any factor, beside which rounding is no matter.
+        units = np.sqrt(np.diagonal(scales[:, kept][:, :, kept], axis1=1, axis2=2))[:, :, None]
+        factors = units * _factors(left / units / np.swapaxes(units, 1, 2))
+        return replace(self, weights=weights, means=means, chols=factors)
 
     def tilted(self, slope: Array) -> "StudentMixture":
         """Near the law of a density that is this one times exp(slope x), with slope (k,).

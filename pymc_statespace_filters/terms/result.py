@@ -11,7 +11,7 @@ from ..pymc_model.posterior_draws import AVERAGED
 from .candidates import Candidates
 from .density import Sets, SubmodelDensity
 from .draws import Averaged, posterior_of
-from .estimates import Visits, Weighted
+from .estimates import LEAST_EFFECTIVE, Visits, Weighted
 from .inclusion import Restriction
 from .probabilities import Probabilities
 from .widths import inclusion_by_width
@@ -78,14 +78,17 @@ def _models(
     candidates: Candidates,
     order: np.ndarray,
 ) -> xr.Dataset:
+    n_effective = np.array([one.n_effective for one in points])
+    # Of a few points far from all that matters not even the order of an error is known.
+    excluded = (found.of_models <= LEAST_SHOWN) & (n_effective < LEAST_EFFECTIVE)
     by_model = {
         "probability": found.of_models,
         "probability_se": found.of_models_se,
         "log_evidence": found.log_evidence,
-        "se": found.error,
+        "se": np.where(excluded, np.nan, found.error),
         "prior": np.exp(found.log_prior) / prior.share,
         "n_evaluations": np.array([one.count for one in points]),
-        "n_effective": np.array([one.n_effective for one in points]),
+        "n_effective": n_effective,
         "pareto_k": np.array([_tail(*each) for each in zip(points, found.of_models, strict=True)]),
     }
     present: Sets = found.present[order]

@@ -93,7 +93,8 @@ def select_terms(
         ``models`` : the sub-models along ``model``, most probable first, with what is ``present``
         along ``term``; ``probability`` with its error ``probability_se``, ``log_evidence`` with its
         error ``se``, ``prior``, and of the points behind it the number ``n_evaluations``, the
-        effective number ``n_effective`` and the tail of their weights, ``pareto_k``.
+        effective number ``n_effective`` and the tail of their weights, ``pareto_k``. ``se`` is NaN
+        for sub-models that the data exclude, whose few points leave the evidence unknown.
 
         ``widths`` : the probabilities of inclusion for slabs that are all wider or narrower by a
         factor, about the values at which the terms vanish; ``plot_prior_sensitivity`` draws it.

@@ -87,16 +87,20 @@ def correlated_target(dim, *, smallest_sd, largest_sd, correlation, seed):
     ids=["its proposals are accepted", "too wide"],
 )
 def test_covariance_is_that_of_the_draws(adapt, every, first_counts):
-    """Once a block moves, C = 2.38^2 / d COV, up to the blend with the first covariance."""
+    """Once a block moves, C = 2.38^2 / d COV, up to the blend with the first covariance.
+
+    In whatever units: their ratios are 1e14.
+    """
     rng = np.random.default_rng(0)
-    dim, n = 3, 100
+    dim, n, units = 3, 100, np.array([1e-7, 1.0, 1e7])
     positions = rng.normal(size=(n, dim)) @ np.tril(rng.normal(size=(dim, dim)))
     accepted = np.arange(n) % every == 0
-    state = feed(adapt, start_adaptation(np.eye(dim)), positions, accepted)
+    state = feed(adapt, start_adaptation(np.diag(units**2)), positions * units, accepted)
 
     weight = accepted.sum() / (accepted.sum() + first_counts)
     learnt = 2.38**2 / dim * np.cov(positions.T, bias=True)
-    np.testing.assert_allclose(state.cov, weight * learnt + (1 - weight) * np.eye(dim), rtol=1e-4)
+    cov = state.cov / np.outer(units, units)
+    np.testing.assert_allclose(cov, weight * learnt + (1 - weight) * np.eye(dim), rtol=1e-4)
     np.testing.assert_allclose(state.chol @ state.chol.T, state.cov, rtol=1e-12)
 
 

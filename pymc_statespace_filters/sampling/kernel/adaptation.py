@@ -4,7 +4,7 @@ Two schemes:
 
 ``"chain"``, the thesis's burn-in (Eqs. 3.27-3.29 and Fig. 4)
     The warm-up is divided into blocks of ``adapt_every`` iterations, each proposing with
-    ``(2.38^2 / d) COV`` of earlier iterations, plus a small multiple of the identity. A block that
+    ``(2.38^2 / d) COV`` of earlier iterations, with slightly larger variances. A block that
     accepts almost nothing says nothing about the covariance; the proposals are scaled down instead.
 ``"continuous"``, adaptive Metropolis (Haario, Saksman and Tamminen 2001)
     The same covariance, updated at every iteration after the first block in which the chain moved.
@@ -13,6 +13,8 @@ The state is a few small arrays, views of one vector, that `learn` changes in pl
 stop before draws are kept: the caller then no longer calls `learn`.
 
 Differences from the sources
+    * Each variance is enlarged by a share of itself, not by a share of their mean: parameters may
+      differ by any factor.
     * "Earlier iterations" are the last block for the first two blocks and from then on the latest
       half to three quarters of the warm-up, so that a bad start is forgotten and yet a covariance
       is not estimated from one block alone, which is poor once d is more than a few.
@@ -65,7 +67,7 @@ MOST_STALLS = 6
 # Weight of the covariance in use before, in accepted moves: for each of its elements if its
 # proposals have a fair acceptance, else for each dimension.
 FAIR_MOVES, LOW_MOVES = 1.0, 0.2
-# The multiple of the identity, relative to the mean variance.
+# Added to each variance, relative to it.
 JITTER = 1e-8
 
 # For functions called only by compiled ones: the wrappers for Python double the compile time.
@@ -229,14 +231,12 @@ def _learn_covariance(state: AdaptationState) -> None:
     is_fair = moments.counts[FIRST] > FAIR_ACCEPTANCE * moments.counts[WALKED]
     weight = moved / (moved + (FAIR_MOVES * dim**2 if is_fair else LOW_MOVES * dim))
     factor = weight * (2.38 * state.numbers[SCALE]) ** 2 / (dim * n)
-    cov, mean_variance = np.empty((dim, dim)), 0.0
+    cov = np.empty((dim, dim))
     for i in range(dim):
         for j in range(i + 1):
             cov[i, j] = factor * moments.scatter[i, j] + (1.0 - weight) * base[i, j]
             cov[j, i] = cov[i, j]
-        mean_variance += cov[i, i] / dim
-    for i in range(dim):
-        cov[i, i] += JITTER * mean_variance
+        cov[i, i] *= 1.0 + JITTER
     chol = _cholesky(cov)
     if 0.0 < chol[dim - 1, dim - 1] < np.inf:  # else the draws have overflowed or are NaN
         _scale_into(state.cov, cov, 1.0)
