@@ -303,7 +303,13 @@ def test_bad_arguments():
 
 def test_one_that_varies_is_to_be_mended_before_others_are_believed():
     table = pd.DataFrame(
-        {"p_value": [0.01, 0.02, 0.5], "time": [61, 30, 5], "change": [-243.0, 0.0013, 1.0]},
+        {
+            "p_value": [0.01, 0.02, 0.5],
+            "p_alone": [0.01, 0.01, 0.4],
+            "statistic": [49.7, 20.0, 0.1],
+            "time": [61, 30, 5],
+            "change": [-243.0, 0.0013, 1.0],
+        },
         index=["level", "noise", "rate"],
     )
     _, first, second, advice = sentences(table, 99)
@@ -311,9 +317,39 @@ def test_one_that_varies_is_to_be_mended_before_others_are_believed():
     assert "noise varies: if it is one jump, it rises by about 0.0013" in second
     assert advice.startswith("Begin with level: ")
     assert len(sentences(table.iloc[1:], 99)) == 2
+    # Equal p-values and statistics of about one size: either may be the one.
+    _, first, _, advice = sentences(table.assign(statistic=[49.7, 45.7, 0.1]), 99)
+    assert first.startswith("level may vary: ")
+    assert advice.startswith("The scan cannot tell level and noise apart: ")
     table["time"] = pd.date_range("2024-05-01", periods=3, freq="30h")
     _, first, second, _ = sentences(table, 99)
     assert first.endswith("before the row at 2024-05-01.")
     assert second.endswith("before the row at 2024-05-02 06:00:00.")
     _, first, *_ = sentences(table.assign(time=[1234.3 + 0.2, 1.0, 2.0]), 99)
     assert first.endswith("before the row at 1234.5.")
+
+
+def test_a_noise_at_zero_is_left_out_and_named():
+    """A normal prior, and data without noise of the process: the mode is at zero, a saddle."""
+    rng = np.random.default_rng(1)
+    observed = 3 * 0.95 ** np.arange(1, 61) + 0.3 * rng.standard_normal(60)
+    system = psf.StateSpaceModel(
+        transition=lambda x, q, a, s: [a * x[0] + s * q[0]],
+        process_noise=[[1.0]],
+        observation=lambda x: [x[0]],
+        observation_noise=[[0.09]],
+        initial_mean=[3.0],
+        initial_cov=[[0.1]],
+    )
+    with pm.Model() as model:
+        pm.Normal("a", 0.5, 0.5)
+        pm.Normal("s", 0.0, 1.0)
+        psf.StateSpace("d", system, psf.EKF(), steps=range(1, 61), observed=observed)
+    start = Point()
+    start.unconstrained = np.array([0.95, 1e-10])
+    scan = psf.drift_scan(start, model, n_simulated=19, random_seed=1, progressbar=False)
+    assert list(scan.index) == ["a"]
+    assert np.isfinite(scan.paths["cumulated"]).all()
+    assert "Left out: s. At the estimate" in repr(scan)
+    with pytest.raises(ModelError, match="has an effect on the likelihood at the estimate"):
+        psf.drift_scan(start, model, parameters="s", n_simulated=19)

@@ -64,7 +64,7 @@ def drift_scan(
     parameters : str or iterable of str, optional
         Parameters of the system, or elements such as ``"A[0, 1]"``. By default all that depend on
         free variables, except those of the start alone. Those that are fixed at numbers can be
-        named, too.
+        named, too. Left out are those without an effect at the estimate, as a noise at zero.
     n_simulated : int
         Number of simulated data sets, at least 19; a p-value is a multiple of 1 / (n_simulated +
         1).
@@ -113,8 +113,10 @@ def drift_scan(
     In a panel each record has its own path.
 
     A change of one parameter also changes the sums of parameters whose scores are correlated with
-    its own, but less: consider the first row first. A large change of a parameter leaves large
-    residuals, so that a noise parameter may seem to vary as well.
+    its own, but less: consider the first row first. Where another statistic is half as large or
+    more, the scan cannot tell both apart; the evidences of a model of `drifting` for each can. A
+    large change of a parameter leaves large residuals, so that a noise parameter may seem to vary
+    as well.
 
     References
     ----------
@@ -162,11 +164,12 @@ def drift_scan(
         variable = ScoredVariable(model, name)
         axis = TimeAxis.of(model, variable)
         test = ConstancyTest(variable, axis.durations, _start(idata, model, variable))
-        chosen = _chosen(test, parameters)
+        chosen, left_out = _chosen(test, parameters)
         with row_progress(test, enabled=progressbar) as announce:
             announce("simulated data sets", n_simulated)
             found = test.run(chosen, n_simulated, rng)
-    return scan_table(found, [variable.labels[i] for i in chosen], axis)
+    labels = variable.labels
+    return scan_table(found, [labels[i] for i in chosen], axis, [labels[i] for i in left_out])
 
 
 def _variable_name(model: pm.Model, var_name: str | None) -> str:
@@ -189,12 +192,14 @@ def _start(idata: Any, model: pm.Model, variable: ScoredVariable) -> Array:
     return np.asarray(tried[np.nanargmax(value)])
 
 
-def _chosen(test: ConstancyTest, parameters: str | Iterable[str] | None) -> NDArray[np.int64]:
-    """The numbers of the scanned elements of theta."""
+def _chosen(
+    test: ConstancyTest, parameters: str | Iterable[str] | None
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The numbers of the elements of theta that are scanned, and of those without an effect."""
     variable, labels = test.variable, test.variable.labels
     after_start = variable.act_after_start
     if parameters is None:
-        return _some(np.flatnonzero(test.moving() & after_start), labels)
+        return _with_effect(test, np.flatnonzero(test.moving() & after_start))
     names = [parameters] if isinstance(parameters, str) else list(parameters)
     owners = [label.split("[")[0] for label in labels]
     if unknown := [name for name in names if name not in [*labels, *owners]]:
@@ -206,13 +211,17 @@ def _chosen(test: ConstancyTest, parameters: str | Iterable[str] | None) -> NDAr
             f"parameters must act after the start of a record, got {at_start}: the equations of "
             "the steps and of the sensor do not use them"
         )
-    return _some(np.flatnonzero(named), labels)
+    return _with_effect(test, np.flatnonzero(named))
 
 
-def _some(chosen: NDArray[np.int64], labels: list[str]) -> NDArray[np.int64]:
-    if not chosen.size:
+def _with_effect(
+    test: ConstancyTest, chosen: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    has_effect = test.has_effect()[chosen]
+    if not has_effect.any():
         raise ModelError(
             "parameters must name what is scanned: no parameter of the system depends on a free "
-            f"variable and acts after the start of a record; there are {labels}"
+            "variable, acts after the start of a record, and has an effect on the likelihood at "
+            f"the estimate; there are {test.variable.labels}"
         )
-    return chosen
+    return chosen[has_effect], chosen[~has_effect]

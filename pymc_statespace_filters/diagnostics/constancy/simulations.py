@@ -14,6 +14,7 @@ from .statistics import Constancy, constancy
 LEAST_LEFT = 0.9  # share of the simulated data sets that must have a likelihood
 BLOCK_SIZE = 2_000_000  # numbers, of the scores of the data sets that are treated at once
 FIRST_SCALE = 0.01  # of the parameters
+LEAST_EFFECT = 1e-12  # squared nats by a step of differences; rounding has about 1e-28
 
 Array = NDArray[np.float64]
 
@@ -63,6 +64,11 @@ class ConstancyTest:
     def moving(self) -> NDArray[np.bool_]:
         """Which parameters depend on free variables."""
         return np.asarray(self.variable.jacobian(self.mode.x).any(axis=(0, 1, 3)))
+
+    def has_effect(self) -> NDArray[np.bool_]:
+        """Which parameters change the likelihood at the mode; a noise at zero does not."""
+        information = (self.mode.scores.by_theta[0] ** 2).sum(axis=0)
+        return np.asarray(information * self._scale**2 > LEAST_EFFECT)
 
     def run(
         self, chosen: NDArray[np.int64], n_simulated: int, rng: np.random.Generator
