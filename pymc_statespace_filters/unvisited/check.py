@@ -173,10 +173,16 @@ def _bridged(
         return (log_constant - 0.5 * (z**2).sum(axis=0)).reshape(x.shape[:-1])
 
     x = centre + rng.standard_normal((count, k)) @ chol.T
-    at_x = evaluate(x, rng) - log_normal(x)
+    return bridged(at_drawn - log_normal(drawn), evaluate(x, rng) - log_normal(x))
+
+
+def bridged(at_drawn: Array, at_x: Array) -> LogMean | None:
+    """The log-evidence from log-densities relative to those of proposals.
+
+    At draws (chain, draw), and at points of the proposals (m,); None if all of these are -inf.
+    """
     if np.isneginf(at_x).all():
         return None
-    at_drawn = at_drawn - log_normal(drawn)
     value = bridge_constant(at_drawn, at_x, 0.0)  # a rough one, of equal numbers
     of_draws = log_mean_of_draws(log_expit(value - at_drawn)).error
     of_points = log_mean_of_independent(log_expit(at_x - value)).error

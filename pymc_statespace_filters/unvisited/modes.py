@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from ..importance import log_mean_of_truncated, normalised, systematic
+from ..importance import LogMean, log_mean_of_truncated, normalised, systematic
 from ..smc.kernel import fitted_mixture
 from ..smc.merging import mean_and_error, merged_index, merged_log_evidence
 from ..smc.particles import Populations
@@ -86,8 +86,8 @@ class MissedMode(NamedTuple):
     Attributes
     ----------
     centre : ndarray (k,)
-    particles : float
-        Share of the particles there.
+    share : float
+        Of the particles, there.
     posterior : float
         Share of the posterior there, at least.
     errors : float
@@ -95,9 +95,14 @@ class MissedMode(NamedTuple):
     """
 
     centre: Array
-    particles: float
+    share: float
     posterior: float
     errors: float
+
+    @property
+    def is_large(self) -> bool:
+        """Whether it is more than chance and worth naming."""
+        return self.errors > MIN_ERRORS and self.posterior > self.share + MIN_MISSED
 
 
 class Place(NamedTuple):
@@ -159,14 +164,20 @@ def missed_mode(
             if not above[best] > MIN_EXCESS:
                 return
             near = visited.x[visited.stage == visited.stage[best]]
-            yield (place := _explored(visited.x[best], near, excess, evaluate, rng))
+            yield (place := explored(visited.x[best], near, excess, evaluate, rng))
             above[best] = -np.inf
             if place is not None:
                 above[place.holds(visited.x)] = -np.inf
 
-    missed = [_compared(one, populations, log_evidences) for one in places() if one is not None]
-    missed = [m for m in missed if m.errors > MIN_ERRORS and m.posterior > m.particles + MIN_MISSED]
-    return max(missed, key=lambda m: m.errors, default=None)
+    def share(place: Place) -> Array:
+        inside = place.holds(populations.particles.x).astype(np.float64)
+        return mean_and_error(inside, populations, log_evidences)
+
+    log_evidence = LogMean(*map(float, merged_log_evidence(log_evidences)))
+    found = [
+        compared(one, log_evidence, *map(float, share(one))) for one in places() if one is not None
+    ]
+    return max((m for m in found if m.is_large), key=lambda m: m.errors, default=None)
 
 
 def _narrowest(
@@ -179,7 +190,7 @@ def _narrowest(
     return _integrated(mean, chol, evaluate, rng)
 
 
-def _explored(
+def explored(
     start: Array, near: Array, excess: Excess, evaluate: Evaluate, rng: np.random.Generator
 ) -> Place | None:
     """What lies around a point of the posterior, met among others; None if nothing is found."""
@@ -232,13 +243,10 @@ def _integrated(
     return place._replace(log_integral=mean.value, error=mean.error)
 
 
-def _compared(place: Place, populations: Populations, log_evidences: Array) -> MissedMode:
-    """Compare the shares of the particles and of the posterior in a place."""
-    total, error = map(float, merged_log_evidence(log_evidences))
-    inside = place.holds(populations.particles.x).astype(np.float64)
-    share, error_of_share = map(float, mean_and_error(inside, populations, log_evidences))
-    ratio = math.exp(min(place.log_integral - total, 50.0))
+def compared(place: Place, log_evidence: LogMean, share: float, error: float) -> MissedMode:
+    """Compare the share of the particles in a place, and its error, with that of the posterior."""
+    ratio = math.exp(min(place.log_integral - log_evidence.value, 50.0))
     posterior = ratio / (ratio + 1 - share) if share < 1 else share
-    of_posterior = posterior * (1 - posterior) * math.hypot(place.error, error)
-    errors = (posterior - share) / max(math.hypot(of_posterior, error_of_share), 1e-9)
+    of_posterior = posterior * (1 - posterior) * math.hypot(place.error, log_evidence.error)
+    errors = (posterior - share) / max(math.hypot(of_posterior, error), 1e-9)
     return MissedMode(place.centre, share, posterior, errors)

@@ -14,13 +14,15 @@ from numpy.typing import NDArray
 
 from ..pymc_model.density import ConstrainedValues
 from ..pymc_model.elements import element_names
+from . import ALL_MODES
 from .check import MissedTail, missed_tails
+from .copies import missed_copy
 from .modes import MissedMode
 from .tail_proposals import Evaluate
 
 ATTRIBUTE = "unvisited"  # of results, a JSON text
 N_SHOWN = 4  # elements of a point
-N_TIMED, N_PARTS = 20, 3  # evaluations whose time is measured; a pause may fall into one part
+N_TIMED, N_PARTS = 40, 3  # evaluations whose time is measured; a pause may fall into one part
 
 Array = NDArray[np.float64]
 
@@ -32,17 +34,28 @@ def unvisited(
     evaluate: Evaluate,
     seconds: float,
     rng: np.random.Generator,
+    prior: Array | None = None,
 ) -> list[str]:
-    """Say of which tails the draws have missed a part, see `missed_tails`.
+    """Say which mode the draws have missed, see `missed_copy`, or of which tails they lack a part.
 
-    ``seconds`` of CPU time are for all evaluations.
+    ``seconds`` of CPU time are for all evaluations of either look. Without draws of the ``prior``
+    (m, k) there is no look for modes.
     """
     x = draws.reshape(-1, draws.shape[-1])
     timed = x[:: max(1, len(x) // N_TIMED)]
     evaluate(timed[:1], rng)  # the first call may compile
     each = min(_seconds_of_each(evaluate, part, rng) for part in np.array_split(timed, N_PARTS))
-    found = missed_tails(draws, log_density, evaluate, seconds / max(each, 1e-7), rng)
-    return [_sentence(model, one) for one in found]
+    n_evaluations = seconds / max(each, 1e-7)
+    sentences = [
+        _sentence(model, one)
+        for one in missed_tails(draws, log_density, evaluate, n_evaluations, rng)
+    ]
+    if prior is not None:
+        shapes = [np.shape(value) for value in model.initial_point().values()]
+        copy = missed_copy(draws, log_density, prior, shapes, evaluate, n_evaluations, rng)
+        if copy is not None:  # a tail that leads there is a part of the same
+            return [_sentence_of_copy(model, copy)]
+    return sentences
 
 
 def _seconds_of_each(evaluate: Evaluate, x: Array, rng: np.random.Generator) -> float:
@@ -74,11 +87,21 @@ def _sentence(model: pm.Model, missed: MissedTail) -> str:
     )
 
 
+def _sentence_of_copy(model: pm.Model, missed: MissedMode) -> str:
+    return (
+        f"the chains have missed a separate mode of the posterior around "
+        f"{_point(model, missed.centre)}: {missed.share:.1%} of the draws lie there, and at least "
+        f"{missed.posterior:.1%} of the posterior ({missed.errors:.1f} standard errors more), so "
+        f"that means, intervals and the evidence lack it; {ALL_MODES}, or "
+        "let the prior exclude all but one"
+    )
+
+
 def sentence_of_mode(model: pm.Model, missed: MissedMode, draws: int) -> str:
     """Say where particles lack a part of the posterior, of populations of so many draws."""
     return (
         f"the particles have missed a part of the posterior around {_point(model, missed.centre)}: "
-        f"{missed.particles:.1%} of them lie there, and at least {missed.posterior:.1%} of the "
+        f"{missed.share:.1%} of them lie there, and at least {missed.posterior:.1%} of the "
         f"posterior ({missed.errors:.1f} standard errors more), so that means, intervals and the "
         f"evidence lack it; raise draws, now {draws}, to several times as many, or reparametrise "
         "the model there (a non-centred form of a hierarchical one)"

@@ -48,6 +48,7 @@ def test_two_modes_are_reported_in_the_models_units(caplog):
         assert height == pytest.approx(peak + 2 * log_normal, abs=0.2)
     assert "flat" not in message
     assert "another order" not in message
+    assert message.endswith("by psf.sample_smc(10_000, model=model).")
 
 
 def test_modes_are_reported_by_sample_dram_with_the_name_of_the_model(caplog):

@@ -12,6 +12,7 @@ from pymc_statespace_filters.sampling.output.remedies import (
     ways_to_mix,
 )
 from pymc_statespace_filters.sampling.output.report import mixing_warning
+from pymc_statespace_filters.unvisited import ALL_MODES
 
 RNG = np.random.default_rng(0)
 NORMAL = RNG.normal(size=4000)
@@ -63,6 +64,15 @@ def test_the_advice():
     assert alternatives(ways_to_mix(model, names, positions, "other")) == (
         "tune longer, use psf.sample(sampler='nuts'), or reparametrise other"
     )
+
+
+def test_draws_of_separate_modes_are_to_be_drawn_from_the_prior():
+    """A heavy tail is no mode."""
+    model, names, positions = drawn(5 + NORMAL)
+    positions[:400, 1] = 20 + NORMAL[:400]
+    assert ways_to_mix(model, names, positions, "other") == [ALL_MODES]
+    positions[:, 1] = RNG.standard_t(2, size=4000)
+    assert ways_to_mix(model, names, positions, "other") != [ALL_MODES]
 
 
 def test_the_advice_works():

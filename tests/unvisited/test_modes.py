@@ -71,7 +71,7 @@ def test_a_mode_that_no_particle_has_met_is_found_with_its_mass(seed):
     """The evidence of the particles is then that of the other mode."""
     found = looked(0.0, seed, lost=-np.log(0.7))
     np.testing.assert_allclose(found.centre, CENTRES[1], atol=0.05)
-    assert found.particles == 0.0
+    assert found.share == 0.0
     assert found.posterior == pytest.approx(0.3, abs=0.06)
     assert found.errors > 5
 
@@ -80,7 +80,7 @@ def test_a_mode_that_no_particle_has_met_is_found_with_its_mass(seed):
 def test_a_mode_that_few_particles_have_met_is_found(seed):
     found = looked(0.1, seed, n_evaluations=SIZES[-1], lost=0.25)
     np.testing.assert_allclose(found.centre, CENTRES[1], atol=0.1)
-    assert found.particles == pytest.approx(0.1, abs=0.04)
+    assert found.share == pytest.approx(0.1, abs=0.04)
     assert found.posterior == pytest.approx(0.3, abs=0.06)
 
 

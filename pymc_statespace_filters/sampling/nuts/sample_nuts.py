@@ -60,7 +60,10 @@ def sample_nuts(
     tree = _tree(model, target, chains, request)
     nothing: list[SamplerWarning] = []
     missed = [
-        *unless_interrupted(lambda: unvisited_warnings(tree, model, chains.seconds, rng), nothing),
+        *unless_interrupted(
+            lambda: unvisited_warnings(tree, model, target.prior_draws, chains.seconds, rng),
+            nothing,
+        ),
         *unless_interrupted(lambda: step_warnings(tree, model), nothing),
     ]
     iterations = request.tune + chains.length.n_iterations

@@ -10,11 +10,13 @@ from pytensor.graph.traversal import ancestors
 from scipy.stats import skew
 
 from ...pymc_model.inspection import gradient_obstacle, kinked_variable, noisy_filters
+from ...unvisited import ALL_MODES
 
 # A posterior reaches zero if at least this share of the draws is below a tenth of the mean, and if
 # logarithms have this skewness: -1.1 with the exponential distribution, -1.5 with the half-normal,
 # zero with a lognormal one of any width.
 _LEAST_SHARE, _MOST_SKEWNESS = 0.01, -1.0
+_LEAST_SIDE, _GAP = 0.02, 0.2  # of the draws, beside a gap; of their range without the ends
 _LEAST_CORRELATION = 0.5  # with another parameter, that can make up for it
 
 Array = NDArray[np.float64]
@@ -30,7 +32,9 @@ def ways_to_mix(model: Model, names: Sequence[str], positions: Array, slowest: s
 
     ``positions`` (n, k) are draws of the elements with these ``names``, unconstrained.
     """
-    if (name := reaches_zero(model, names, positions)) is not None:
+    if _is_divided(positions[:, list(names).index(slowest)]):
+        ways = [ALL_MODES]
+    elif (name := reaches_zero(model, names, positions)) is not None:
         ways = [without_transform(name)]
     else:
         ways = ["tune longer"]
@@ -67,6 +71,13 @@ def reaches_zero(model: Model, names: Sequence[str], positions: Array) -> str | 
                 found[rv.name] = _largest_correlation(x, np.delete(positions, i, axis=1))
     most = max(found, key=lambda name: found[name], default=None)
     return most if most is not None and found[most] > _LEAST_CORRELATION else None
+
+
+def _is_divided(x: Array) -> bool:
+    """Whether draws (n,) are in groups far from each other, as those of separate modes."""
+    low, high = np.quantile(x, [_LEAST_SIDE, 1 - _LEAST_SIDE])
+    inside = np.sort(x[(x >= low) & (x <= high)])
+    return bool(np.diff(inside).max(initial=0.0) > _GAP * (high - low))
 
 
 def _largest_correlation(x: Array, others: Array) -> float:

@@ -7,6 +7,7 @@ from xarray import DataTree
 
 from ...pymc_model.density import ModelDensity
 from ...pymc_model.posterior_draws import noise_was_moved, unconstrained_draws
+from ..target.initial_points import PriorDraws
 from .warnings import sampler_warning
 
 # CPU seconds: so many, or this share of the time of the run if that is more.
@@ -16,9 +17,9 @@ _LEAST_DRAWS = 4000
 
 
 def unvisited_warnings(
-    tree: DataTree, model: Model, seconds: float, rng: np.random.Generator
+    tree: DataTree, model: Model, prior: PriorDraws, seconds: float, rng: np.random.Generator
 ) -> list[SamplerWarning]:
-    """Warn of tails of the posterior that the chains of a run of so many seconds have missed.
+    """Warn of modes and tails of the posterior that the chains of a run of so many seconds lack.
 
     The outcome is stored with the draws. Chains that held one noise seed are not checked.
     """
@@ -44,6 +45,7 @@ def unvisited_warnings(
 
     log_density = stats["lp"].transpose("chain", "draw").values.astype(np.float64)
     seconds = max(_LEAST_SECONDS, _SHARE * seconds)
-    found = unvisited(model, draws, log_density, evaluate, seconds, rng)
+    wide = prior.draws if prior.is_prior else None
+    found = unvisited(model, draws, log_density, evaluate, seconds, rng, wide)
     store(tree, found)
     return [sampler_warning(f"{text[0].upper()}{text[1:]}.") for text in found]

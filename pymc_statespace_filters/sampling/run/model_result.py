@@ -145,7 +145,8 @@ class ModelResult:
 
     def _unvisited_warnings(self, tree: DataTree, key: np.ndarray) -> list[SamplerWarning]:
         """Warn of what the chains have missed of the posterior."""
-        return unvisited_warnings(tree, self.model, self.seconds, side_generator(key, 3))
+        prior, rng = self.target.prior_draws, side_generator(key, 3)
+        return unvisited_warnings(tree, self.model, prior, self.seconds, rng)
 
     def _check_filters(self, tree: DataTree, key: np.ndarray) -> FilterCheck:
         """Compare the filters with unbiased ones at some draws."""

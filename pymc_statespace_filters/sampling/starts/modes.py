@@ -18,6 +18,7 @@ from scipy.spatial.distance import cdist
 
 from ...pymc_model.density import ConstrainedValues
 from ...student_mixture import fit_mixture, place_components, standardised
+from ...unvisited import ALL_MODES
 from ..target.variables import RaveledVariables
 
 # With these, at most 120 evaluations of the log-density; the search for starts makes 2560 or more.
@@ -113,7 +114,7 @@ def modes_message(model: Model, raveled: RaveledVariables, points: Points) -> st
         for i, top, value in zip(large, highest, values, strict=True)
     ]
     of_modes = [[at(x) for x in points.x[some[:_N_COMPARED]]] for some in members]
-    advice = _LABELS if _are_orders(of_modes) else ""
+    advice = _LABELS if _are_orders(of_modes) else f" {ALL_MODES[0].upper()}{ALL_MODES[1:]}."
     return (
         f"The posterior has {len(large)} separate modes: {' and '.join(described)}. A mean over "
         f"all modes may lie in none of them.{advice}"
@@ -161,7 +162,7 @@ def modes_warning(message: str) -> SamplerWarning:
 def _differing(model: Model, raveled: RaveledVariables, modes: list[Array]) -> list[str]:
     """The variables that differ between modes, the most different first."""
     means = np.array([x.mean(axis=0) for x in modes])
-    within = np.mean([x.std(axis=0) for x in modes], axis=0)
+    within = np.min([x.std(axis=0) for x in modes], axis=0)  # one may be several, further out
     apart = np.ptp(means, axis=0) / np.where(within > 0, within, np.inf)
     order = np.argsort(-apart)
     chosen = [i for i in order if apart[i] > _APART] or [order[0]]
