@@ -16,6 +16,7 @@ from ..filters.recommendation import (
     exact_filter,
     jump_problem,
     repetition_problem,
+    rounding_problem,
     short_form,
 )
 from ..ops.base import evaluator
@@ -161,10 +162,10 @@ def _named(labels: Sequence[Any] | None, of_each: Any, chosen: np.ndarray) -> st
 
 
 def warn_of_choice(system: StateSpaceModel, filter: Any) -> None:
-    """Warn if the filter linearises an equation that jumps, or repeats a run without noise."""
+    """Warn if the filter linearises what jumps, repeats a run without noise, or has no digits."""
     compiled = compile_system(system)
-    for problem in (jump_problem(compiled, filter), repetition_problem(compiled, filter)):
-        if problem is not None:
+    for problem_of in (jump_problem, repetition_problem, rounding_problem):
+        if (problem := problem_of(compiled, filter)) is not None:
             warnings.warn(problem, FilterWarning, skip_file_prefixes=INSIDE)
 
 

@@ -116,3 +116,28 @@ def test_large_differences_have_no_decimals(observed, nats):
 @pytest.mark.parametrize("smallest", [COLLAPSED, np.inf])
 def test_enough_particles_are_not_warned_of(smallest):
     assert warned([[smallest, 0.0, -1.0]]) == ([], [])
+
+
+def test_a_start_that_leaves_a_covariance_without_digits_is_named():
+    """Not where one state alone starts so, which is observed, nor in other units."""
+    turn = np.array([[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]])
+    observed = np.array([4.7, 6.1, 5.5, 6.2])
+
+    def terms(variances, gain=1.0, noise=0.25):
+        system = psf.StateSpaceModel(
+            lambda x, q: turn @ x + 0.1 * q, process_noise=np.eye(2), initial_mean=[0.0, 0.0],
+            observation=lambda x: [gain * x[0]], observation_noise=[[noise]],
+            initial_cov=np.diag(variances),
+        )  # fmt: skip
+        return psf.log_likelihood(system, psf.EKF(), {}, observed, steps=range(4))
+
+    with pytest.warns(
+        psf.errors.FilterWarning, match=r"^EKF\(\): initial_cov is so large that the"
+    ):
+        terms([1e14, 1e14])
+    wide = terms([0.25e8, 0.25e8])
+    # What is advised says as little: two diffuse states take log sd off the first two terms.
+    wider = terms([0.25e9, 0.25e9])
+    np.testing.assert_allclose(wide - wider, [np.log(10) / 2, np.log(10) / 2, 0, 0], atol=1e-5)
+    terms([1e14, 1.0])
+    terms([1e10, 1e10], gain=1e-6, noise=1e-6)

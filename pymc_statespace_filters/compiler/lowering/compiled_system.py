@@ -321,6 +321,11 @@ class CompiledSystem:
         return structure.has_exact_sensor(self.asked)
 
     @cached_property
+    def start_over_noise(self) -> float:
+        """How many times its noise the variance of an observation of the start is, if known."""
+        return structure.start_over_noise(self.asked)
+
+    @cached_property
     def is_time_invariant(self) -> bool:
         """Whether `step_moments` depends on neither inputs nor time; False if unknown."""
         symbols = {name: symbols_of(self.asked)[name] for name in ("theta", *"xut")}

@@ -10,6 +10,7 @@ import pytensor.tensor as pt
 from pymc.pytensorf import constant_fold
 from pytensor.graph.basic import Constant, Variable
 from pytensor.graph.fg import FrozenFunctionGraph
+from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
 from ...system.model import StateSpaceModel
@@ -30,6 +31,7 @@ from .symbols import (
 )
 
 _N_TRIALS = 5
+_LARGE_START = 1e10  # times the variance of a sensor's noise
 KINKED = (
     ps.Switch, ps.Abs, ps.ScalarMaximum, ps.ScalarMinimum, ps.Clip, ps.Sign, ps.Floor, ps.Ceil,
     ps.Mod, ps.IntDiv, ps.Cast,
@@ -236,6 +238,32 @@ def has_exact_sensor(system: StateSpaceModel) -> bool:
         return any(_zeros(pt.diagonal(cov), symbols))
     eigenvalues = np.linalg.eigvalsh(cov.data)
     return bool(eigenvalues.min() <= 1e-12 * eigenvalues.max())
+
+
+def start_over_noise(system: StateSpaceModel) -> float:
+    """How many times its noise the variance of an observation of the start is; 1 if unknown.
+
+    Where two states or more start with large variances, and these are numbers; by the slope of the
+    sensor at the initial mean and at parameters of one.
+    """
+    if system.n < 2 or not (system.gaussian_observation and system.has_gaussian_start):
+        return 1.0
+    symbols = symbols_of(system)
+    start = call(system.equations.initial_cov, system, symbols)
+    seen, noise = observation_moments(system, symbols)
+    if not (isinstance(start, Constant) and isinstance(noise, Constant)):
+        return 1.0
+    variances, of_noise = np.sort(start.data.diagonal()), noise.data.diagonal()
+    if not 0.0 < of_noise.min() * _LARGE_START < variances[-2]:
+        return 1.0
+    x = call(system.equations.initial_mean, system, symbols)
+    (gain,) = graph_replace([jacobian_of(seen, symbols["x"])], {symbols["x"]: x}, strict=False)
+    inputs = [symbols[name] for name in ("theta", "u", "t")]
+    slope = pytensor.function(inputs, gain, mode="FAST_COMPILE", on_unused_input="ignore")(
+        *(np.ones(value.type.shape) for value in inputs)
+    )
+    ratios = np.einsum("ij,jk,ik->i", slope, start.data, slope) / of_noise
+    return float(np.nanmax(ratios, initial=1.0))
 
 
 def process_noise_reaches_every_state(system: StateSpaceModel) -> bool:
