@@ -1,5 +1,6 @@
 """Forecasts of states and observations at draws of the posterior."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,14 @@ from ..evaluation.simulate import continuation
 from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.state_space_variable import observed_variables
-from ..system.checks import check_random_seed, is_integer
-from ..system.given_record import inputs_with_times
-from ..system.input_columns import only_seen
+from ..system.checks import check_floats, check_random_seed, is_integer
+from ..system.given_record import inputs_with_times, own_inputs
+from ..system.input_columns import inputs_of_user, n_input_rows, only_seen
+from ..system.labels import columns_in_order
 from ..system.model import StateSpaceModel
 from ..system.own_units import in_own_units
 from ..system.placement import check_takes
+from ..system.record import inputs_of_other_shape
 from ..system.steps import GRID_TOLERANCE, check_steps
 from ..system.time_axis import TimeAxis, TimesBetween, axis_of, check_increasing, is_grid
 from ..system.timed_inputs import check_inputs_at, timed_inputs
@@ -64,8 +67,10 @@ def forecast(
     times : array_like, shape (R,), optional
         Times after the last observation, numbers or dates as those of the model.
     inputs : array_like, shape (rows, n_inputs), optional
-        Inputs from step 0 on, past and future, row k during step k; required if those of the model
-        end before the last step. Of a panel also an array for each record, as in `StateSpace`.
+        Inputs from step 0 on, past and future, row k during step k; or the future ones alone, a row
+        for each step after the last observation, which follow those of the model. Required if
+        those of the model end before the last step. Of a panel also an array for each record, as
+        in `StateSpace`.
     input_times, inputs_at
         Times of the rows of `inputs`, and what inputs are between them, as in `StateSpace`. Inputs
         of the model with times of their own go on with their last value where no others are given,
@@ -127,6 +132,8 @@ def forecast(
             pairs = zip(timed, axes, at_draws.records, strict=True)
             inputs = [one.rows(axis, variable.clock, r.number) for (one, _), axis, r in pairs]
             inputs = inputs if variable.is_panel else inputs[0]
+        elif inputs is not None:
+            inputs = _from_step_0(inputs, at_draws, axes)
         future = [axis.steps for axis in axes]
         axes = [
             axis._replace(steps=np.concatenate([record.steps, axis.steps]))
@@ -194,6 +201,32 @@ def _timed_inputs(
             for earlier, one, record in zip(variable.timed, found, records, strict=True)
         ]
     return [(one, one.changes()) for one in found]
+
+
+def _from_step_0(inputs: Any, at_draws: VariableAtDraws, axes: Sequence[TimeAxis]) -> Any:
+    """The inputs with those of the model before them where they are future ones alone."""
+    records, is_panel = at_draws.records, at_draws.variable.is_panel
+    own = own_inputs(inputs, [record.label for record in records]) if is_panel else None
+    parts = [inputs] * len(records) if own is None else own
+    whole = [_after_past(*each) for each in zip(parts, records, axes, strict=True)]
+    if all(one is part for one, part in zip(whole, parts, strict=True)):
+        return inputs
+    return whole if is_panel else whole[0]
+
+
+def _after_past(given: Any, record: RecordAtDraws, axis: TimeAxis) -> Any:
+    """The inputs of a record, from step 0 on if they have a row for each step to predict."""
+    system = record.variable.system
+    past = inputs_of_user(system, record.inputs)
+    n_past, n_rows = n_input_rows(system, record.steps), n_input_rows(system, axis.steps)
+    is_future = n_past > 0 and np.shape(given)[:1] == (n_rows - n_past,)
+    if not is_future or len(past) > 1 or axis.starts is not None:
+        return given
+    ahead = check_floats("inputs", columns_in_order("inputs", given, system.inputs, "inputs"), None)
+    ahead = ahead[:, None] if ahead.ndim == 1 else ahead
+    if ahead.shape[1:] != (system.n_inputs,):
+        raise inputs_of_other_shape(system, ahead.shape)
+    return np.concatenate([past[0, :n_past], ahead])
 
 
 def _future_axis(

@@ -100,6 +100,13 @@ def test_inputs_of_the_record_and_of_the_future():
         assert_drawn_from(joined(group), *pushed_joint_law(force), RATE)
 
 
+def test_future_inputs_alone_follow_those_of_the_model():
+    idata, model = posterior(a=A), pushed_model()
+    whole = predictions(idata, model, steps=FUTURE, inputs=LONG_FORCE)
+    alone = predictions(idata, model, steps=FUTURE, inputs=LONG_FORCE[7:])
+    assert alone.to_dataset().identical(whole.to_dataset())
+
+
 def test_inputs_of_the_model_reach_beyond_its_record():
     """They depend on a free variable, too: each draw has its own."""
     with pm.Model() as model:
@@ -214,6 +221,7 @@ WRONG = [
     (dict(times=[13.6]), r"times\[0\] = .*13.6.* is off the grid t0 \+ k\*dt with t0 = 10"),
     (dict(n_steps=2), "the model's inputs end after 7 rows, and step 8 needs 9"),
     (dict(n_steps=2, inputs=FORCE), "inputs must have at least 9 rows.* step 8 .*got 7"),
+    (dict(n_steps=2, inputs=np.zeros((2, 2))), r"inputs must have shape \(steps, 1\)"),
     (dict(n_steps=2, inputs=np.zeros((10, 2))), r"inputs must have shape \(steps, 1\)"),
     (dict(n_steps=2, inputs="none"), "inputs must be numbers"),
 ]

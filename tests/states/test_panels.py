@@ -186,6 +186,9 @@ def test_forecasts_with_other_inputs():
     found = psf.forecast(idata, model, n_steps=2, inputs=FORCES, random_seed=1)
     expected = psf.forecast(posterior(a=A), panel_model(), n_steps=2, random_seed=1)
     assert found["predictions"].identical(expected["predictions"])
+    ahead = {label: force[len(short[label]) :][:2] for label, force in FORCES.items()}
+    found = psf.forecast(posterior(a=A), model, n_steps=2, inputs=ahead, random_seed=1)
+    assert found["predictions"].identical(expected["predictions"])
 
 
 def test_steps_to_forecast_are_after_all_records():
