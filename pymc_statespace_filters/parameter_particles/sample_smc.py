@@ -108,7 +108,9 @@ def sample_smc(
     Returns
     -------
     xarray.DataTree
-        None on ranks that do not get it.
+        None on ranks that do not get it. After Ctrl-C in "sequential", without other ranks, that of
+        the rows so far, which `extend` goes on from. The particles of "tempered" are draws of the
+        posterior at the end alone: until then Ctrl-C raises, and only a checkpoint keeps the run.
         ``posterior`` and ``sample_stats`` (chain, draw), equally likely draws: particles of all
         populations, in proportion to weight and to the evidence that their population has found, in
         the order of their chains. A chain is nearly a population; ``sample_stats["population"]`` is
