@@ -31,7 +31,7 @@ def leave_future_out(
     idata: xr.DataTree,
     model: pm.Model | None = None,
     *,
-    min_observations: int,
+    min_observations: int | None = None,
     var_name: str | None = None,
     refit: Refit | None = None,
     progressbar: bool = True,
@@ -69,10 +69,12 @@ def leave_future_out(
         used if `compute_log_likelihood` stored them; otherwise they are computed.
     model : pymc.Model, optional
         The model of the draws; by default that of the ``with`` block.
-    min_observations : int
+    min_observations : int, optional
         Number of observations before the first that is scored, not counting those entirely missing
         or before the variable's ``score_from``.
-        At least 1 with `refit`, else 0. It must be the same for models to be compared.
+        At least 1 with `refit`, which needs it, else 0. By default the smallest that leaves only
+        reliable scores, which is ``min_observations`` of the result. It must be the same for models
+        to be compared: the largest of theirs.
     var_name : str, optional
         Name of the StateSpace variable, if the model has several. Other observed variables count as
         known from the beginning.
@@ -139,7 +141,8 @@ def leave_future_out(
     time, name = variable.dims[0], variable.name
     observed = np.flatnonzero(~np.isnan(observed_values(model, name)).all(axis=1))
     observed = observed[observed >= variable.score_from]
-    _check_min_observations(min_observations, 0 if refit is None else 1, observed.size, name)
+    if min_observations is not None or refit is not None:
+        _check_min_observations(min_observations, 0 if refit is None else 1, observed.size, name)
     terms = _stored_terms(idata, name)
     if terms is None:
         draws = select_draws(idata, None)
@@ -174,7 +177,7 @@ def _one_variable(model: pm.Model, var_name: str | None) -> StateSpaceVariable:
     return variables[0]
 
 
-def _check_min_observations(given: int, least: int, n_observations: int, name: str) -> None:
+def _check_min_observations(given: int | None, least: int, n_observations: int, name: str) -> None:
     if not (is_integer(given) and least <= given < n_observations):
         raise ModelError(
             f"min_observations must be an integer from {least} to {n_observations - 1}, as "
@@ -192,11 +195,12 @@ def _stored_terms(idata: xr.DataTree, name: str) -> xr.DataArray | None:
 
 
 def _score_by_reweighting(
-    idata: xr.DataTree, terms: xr.DataArray, min_observations: int
+    idata: xr.DataTree, terms: xr.DataArray, min_observations: int | None
 ) -> ELPDDataLFO:
     """Scores from draws given all observations, reweighted to those given the earlier ones."""
     rows = terms.values.reshape(-1, terms.shape[-1])
-    scored = rows[:, min_observations:]
+    first = min_observations or 0
+    scored = rows[:, first:]
     removed = np.cumsum(scored[:, ::-1], axis=1)[:, ::-1]  # log-likelihood of d_j and all later
     efficiency = _efficiency(idata)
     weighted = [smoothed(-column, efficiency) for column in removed.T]
@@ -205,16 +209,20 @@ def _score_by_reweighting(
     pareto_k = np.where(np.isneginf(pareto_k), np.inf, pareto_k)
     good_k = largest_good_k(len(rows))
     known = pareto_k <= good_k
+    if min_observations is None and known[-1]:
+        first = int(np.append(-1, np.flatnonzero(~known))[-1]) + 1
+        known, pareto_k = known[first:], pareto_k[first:]
+        scored, log_weights = scored[:, first:], log_weights[first:]
     scores = logsumexp(log_weights + scored.T, axis=1) - logsumexp(log_weights, axis=1)
     elpd_i = np.where(known, scores, np.nan)
     p_i = logsumexp(scored, axis=0) - np.log(len(scored)) - elpd_i
     if not known.all():
-        message = _missing(known, good_k, min_observations)
+        message = _missing(known, good_k, first)
         warnings.warn(message, EvidenceWarning, skip_file_prefixes=INSIDE)
 
     def by_time(values: NDArray[np.float64]) -> xr.DataArray:
         time = terms.dims[-1]
-        coords = {time: terms[time][min_observations:]} if time in terms.coords else {}
+        coords = {time: terms[time][first:]} if time in terms.coords else {}
         return xr.DataArray(values, dims=[time], coords=coords)
 
     complete = bool(known.all())
@@ -230,7 +238,7 @@ def _score_by_reweighting(
         elpd_i=by_time(elpd_i),
         pareto_k=by_time(pareto_k),
         forecast_horizon=1,
-        min_observations=min_observations,
+        min_observations=first,
         refits=np.array([], dtype=int),
         n_refits=0,
         p_lfo_i=by_time(p_i),

@@ -133,6 +133,11 @@ def test_what_the_draws_cannot_tell_is_missing(exact):
     enough = 2 + int(np.flatnonzero(unknown)[-1]) + 1
     assert f"set min_observations={enough}, or" in str(caught[0].message)
     assert np.isfinite(psf.leave_future_out(few, exact, min_observations=enough).elpd)
+    # By default they begin there.
+    default = psf.leave_future_out(few, exact)
+    assert default.min_observations == enough
+    np.testing.assert_array_equal(default.elpd_i, found.elpd_i[enough - 2 :])
+    assert type(default) is az.ELPDDataLFO
 
 
 def test_missing_scores_are_not_compared(exact, idata):
@@ -172,6 +177,9 @@ def test_models_are_compared_by_arviz(exact, idata):
     table = az.compare({"other": other, "found": found}, round_to="none")
     assert table.loc["found", "elpd"] == found.elpd
     assert table["elpd_diff"].iloc[1] == pytest.approx(-abs(found.elpd - other.elpd), rel=1e-9)
+    shorter = psf.leave_future_out(idata, exact, min_observations=17)
+    with pytest.raises(ValueError, match="same forecast_horizon and min_observations"):
+        az.compare({"other": other, "shorter": shorter})
 
 
 def test_a_shortened_model_differs_by_its_record_alone(noisy):
@@ -195,5 +203,6 @@ def test_a_number_of_observations_that_leaves_nothing_is_refused(exact, idata, g
 
 
 def test_a_refit_needs_an_observation(exact, idata, refit):
-    with pytest.raises(ModelError, match=f"from 1 to {N - 1}"):
-        psf.leave_future_out(idata, exact, min_observations=0, refit=refit)
+    for given in (0, None):
+        with pytest.raises(ModelError, match=f"from 1 to {N - 1}"):
+            psf.leave_future_out(idata, exact, min_observations=given, refit=refit)
