@@ -16,7 +16,7 @@ from .markov_chain.backward import BACKWARD
 from .markov_chain.forward import FORWARD
 from .markov_chain.functions import chain_functions, is_smooth_in_parameters, table_of_states
 from .markov_chain.predictions import PREDICTIONS_OF_CHAIN
-from .markov_chain.states import MOMENTS, RUN_OF_CHAIN, STATES_OF_CHAIN
+from .markov_chain.states import FILTERED, MOMENTS, STATES_OF_CHAIN
 from .plan import make_plan
 from .protocol import System, check_sensor_has_noise
 from .signatures import PREDICTIONS, RUN, STATES
@@ -157,7 +157,8 @@ class FiniteStateFilter(TapedFilter):
     def compile_run(self, system: System) -> PlannedFunction:
         """Compile one run: its members are all states, and their weights the probabilities."""
         n_states = len(self._finite_states(system).joint)
-        return PlannedFunction(self._plan(system, RUN_OF_CHAIN, n_members=n_states), *RUN)
+        plan = self._plan(system, STATES_OF_CHAIN, n_members=n_states, last_event=FILTERED)
+        return PlannedFunction(plan, *RUN)
 
     def law_of_state(self, system: System, states: np.ndarray) -> StateLaw:
         """Return the law of the state, from what the filter leaves (m, S) at m points."""

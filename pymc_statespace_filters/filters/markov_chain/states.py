@@ -197,27 +197,7 @@ def _moments(chain, weights, mean, cov):
 
 
 def _states(plan, record, request, results):
-    status, call = opened(plan, record, request, results)
-    if status != OK or call.request[REQUEST.sizes_only]:
-        return status
-    rows, to, n = wanted_rows(call), call.results, call.plan[PLAN.n]
-    paths = np.zeros(rows.size, np.int64)
-    chain, weights = _probabilities(call, rows, call.plan[PLAN.last_event], paths)
-    mean, sd = reals_at(to[RESULTS.mean], (rows.size, n)), reals_at(to[RESULTS.sd], (rows.size, n))
-    drawn = reals_at(to[RESULTS.drawn], (rows.size, n))
-    n_effective = reals_at(to[RESULTS.n_effective_wanted], (rows.size,))
-    cov = np.empty((n, n))
-    for r in range(rows.size):
-        _moments(chain, weights[r], mean[r], cov)
-        is_known = not np.isnan(weights[r, 0])
-        n_effective[r] = np.inf if is_known else np.nan
-        for a in range(n):
-            sd[r, a] = math.sqrt(cov[a, a])
-            drawn[r, a] = chain.X[a, paths[r]] if is_known else np.nan
-    return status
-
-
-def _run(plan, record, request, results):
+    """Moments, and draws or the members of a run, whichever are wanted."""
     status, call = opened(plan, record, request, results)
     if status != OK:
         return status
@@ -227,20 +207,35 @@ def _run(plan, record, request, results):
     if call.request[REQUEST.sizes_only]:
         return status
     rows, to, n = wanted_rows(call), call.results, call.plan[PLAN.n]
-    chain, found = _probabilities(call, rows, FILTERED, np.zeros(rows.size, np.int64))
+    paths = np.zeros(rows.size, np.int64)
+    chain, found = _probabilities(call, rows, call.plan[PLAN.last_event], paths)
     K = chain.n_states
-    mean = reals_at(to[RESULTS.mean], (rows.size, n))
-    cov = reals_at(to[RESULTS.cov], (rows.size, n, n))
-    members = reals_at(to[RESULTS.members], (rows.size, K, n))
-    weights = reals_at(to[RESULTS.weights], (rows.size, K))
+    n_drawn = rows.size if to[RESULTS.drawn] != 0 else 0
+    n_run = rows.size if to[RESULTS.members] != 0 else 0
+    mean, sd = reals_at(to[RESULTS.mean], (rows.size, n)), reals_at(to[RESULTS.sd], (n_drawn, n))
+    drawn = reals_at(to[RESULTS.drawn], (n_drawn, n))
+    n_effective = reals_at(to[RESULTS.n_effective_wanted], (n_drawn,))
+    covs = reals_at(to[RESULTS.cov], (n_run, n, n))
+    members = reals_at(to[RESULTS.members], (n_run, K, n))
+    weights = reals_at(to[RESULTS.weights], (n_run, K))
+    cov = np.empty((n, n))
     for r in range(rows.size):
-        _moments(chain, found[r], mean[r], cov[r])
-        for i in range(K):
-            weights[r, i] = found[r, i]
+        _moments(chain, found[r], mean[r], cov)
+        if n_drawn:
+            is_known = not np.isnan(found[r, 0])
+            n_effective[r] = np.inf if is_known else np.nan
             for a in range(n):
-                members[r, i, a] = chain.X[a, i]
+                sd[r, a] = math.sqrt(cov[a, a])
+                drawn[r, a] = chain.X[a, paths[r]] if is_known else np.nan
+        if n_run:
+            for a in range(n):
+                for b in range(n):
+                    covs[r, a, b] = cov[a, b]
+            for i in range(K):
+                weights[r, i] = found[r, i]
+                for a in range(n):
+                    members[r, i, a] = chain.X[a, i]
     return status
 
 
 STATES_OF_CHAIN = plan_entry(_states, "markov_chain_states")
-RUN_OF_CHAIN = plan_entry(_run, "markov_chain_run")
