@@ -54,38 +54,54 @@ def missed_copy(
     """
     k = draws.shape[-1]
     n_leaps = int(min(LEAPS * n_evaluations, MOST * k))
-    step = -(-log_density.size // N_FITTED)
-    fitted = standardised(draws[:, ::2].reshape(-1, k)[:: -(-step // 2)])
-    if fitted is None or n_leaps < FEWEST * k or n_evaluations < N_BRIDGE + sum(SIZES):
+    if n_leaps < FEWEST * k or n_evaluations < N_BRIDGE + sum(SIZES):
         return None
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):  # points far beyond the draws
+            found = _missed(draws, log_density, prior, shapes, evaluate, n_leaps, rng)
+    except np.linalg.LinAlgError:  # draws that do not vary in every direction
+        return None
+    return max(found, key=lambda m: m.posterior, default=None)
+
+
+def _missed(
+    draws: Array,
+    log_density: Array,
+    prior: Array,
+    shapes: Sequence[tuple[int, ...]],
+    evaluate: Evaluate,
+    n_leaps: int,
+    rng: np.random.Generator,
+) -> list[MissedMode]:
+    """The modes found from so many points."""
+    flat = draws.reshape(-1, draws.shape[-1])
+    fitted = standardised(flat[:: 1 + log_density.size // N_FITTED])
+    if fitted is None:
+        return []
     mixture = fitted_mixture(fitted, rng)
-    drawn, at_drawn = draws[:, 1::2], log_density[:, 1::2]
-    at_drawn = at_drawn - mixture.log_density(drawn.reshape(-1, k)).reshape(at_drawn.shape)
+    at_drawn = log_density - mixture.log_density(flat).reshape(log_density.shape)
     level = float(np.median(at_drawn))
 
     def excess(x: Array, log_density: Array) -> Array:
         return np.asarray(log_density - mixture.log_density(x) - level)
 
-    best = draws[np.unravel_index(log_density.argmax(), log_density.shape)]
-    x, at_x = _leaps(best, prior, shapes, evaluate, n_leaps, rng)
+    x, at_x = _leaps(flat[log_density.argmax()], prior, shapes, evaluate, n_leaps, rng)
     at_x[~(excess(x, at_x) > MIN_EXCESS)] = -np.inf
     if np.isneginf(at_x).all():
-        return None
+        return []
     log_evidence = _log_evidence(at_drawn, mixture, evaluate, rng)
-    if log_evidence is None:
-        return None
     found = []
     for _ in range(N_PLACES):
-        if np.isneginf(at_x[start := int(at_x.argmax())]):
+        if log_evidence is None or np.isneginf(at_x[start := int(at_x.argmax())]):
             break
-        place = explored(x[start], draws.reshape(-1, k), excess, evaluate, rng)
+        place = explored(x[start], flat, excess, evaluate, rng)
         at_x[start] = -np.inf
         if place is not None:
             at_x[place.holds(x)] = -np.inf
             missed = compared(place, log_evidence, *_share(place, draws))
-            if missed.is_large and _is_apart(place, fitted.chol, draws, evaluate, rng):
+            if missed.is_large and _is_apart(place, fitted.chol, flat, evaluate, rng):
                 found.append(missed)
-    return max(found, key=lambda m: m.posterior, default=None)
+    return found
 
 
 def _log_evidence(
@@ -104,10 +120,9 @@ def _share(place: Place, draws: Array) -> tuple[float, float]:
 
 
 def _is_apart(
-    place: Place, chol: Array, draws: Array, evaluate: Evaluate, rng: np.random.Generator
+    place: Place, chol: Array, x: Array, evaluate: Evaluate, rng: np.random.Generator
 ) -> bool:
-    """Whether the density falls between a place and the nearest draw outside of it."""
-    x = draws.reshape(-1, draws.shape[-1])
+    """Whether the density falls between a place and the nearest draw (n, k) outside of it."""
     outside = x[~place.holds(x)]
     distance = (np.linalg.solve(chol, (outside - place.centre).T) ** 2).sum(axis=0)
     if not distance.size:

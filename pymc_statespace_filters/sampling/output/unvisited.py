@@ -45,7 +45,7 @@ def unvisited_warnings(
 
     log_density = stats["lp"].transpose("chain", "draw").values.astype(np.float64)
     seconds = max(_LEAST_SECONDS, _SHARE * seconds)
-    wide = prior.draws if prior.is_prior else None
+    wide = prior.draws if prior.is_prior and len(prior.draws) > 1 else None
     found = unvisited(model, draws, log_density, evaluate, seconds, rng, wide)
     store(tree, found)
     return [sampler_warning(f"{text[0].upper()}{text[1:]}.") for text in found]
