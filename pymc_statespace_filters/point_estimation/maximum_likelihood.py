@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from pymc.model import Model
 
 from ..errors import ModelError
-from ..evidence.estimators.newton import BatchFunction
+from ..evidence.estimators.newton import BatchFunction, WithGradient
+from ..progress import row_progress
 from ..pymc_model.density import ConstrainedValues
 from ..pymc_model.elements import labels_of
 from ..pymc_model.inspection import given_model
@@ -21,6 +22,7 @@ from ..pymc_model.stepped import stepped_variables
 from ..sampling.starts.annealing import N_SWEEPS, Population
 from ..sampling.starts.modes import is_reordered
 from ..sampling.starts.population import population_of
+from ..sampling.target.target import MANY_DIMENSIONS
 from ..system.checks import check_random_seed
 from .estimate import (
     EDGE,
@@ -38,6 +40,7 @@ from .stepped import maximize_stepped
 
 Array = NDArray[np.float64]
 
+TYPICAL_EVALUATIONS = 50  # times (k + 1)^2, for the progress bar
 STEP = 1e-3  # of the differences, in standard deviations of the population
 # Standard errors, of a move along a direction that changes a parameter; with noisy directions.
 INVOLVED, INVOLVED_NOISY = 0.05, 0.5
@@ -107,7 +110,8 @@ def maximum_likelihood(
     interval for a staircase. A parameter at a bound counts as known for the errors of the others.
 
     The population costs 3000 to 16 000 evaluations of the likelihood, in threads; Newton's method
-    about 50 (k + 1)² for k parameters, the quadratics 4000 to 10 000.
+    about 50 (k + 1)² for k parameters, the quadratics 4000 to 10 000. From nine parameters on, a
+    likelihood with a gradient costs some 200 (k + 1) evaluations and 40 (k + 1) gradients.
 
     If the likelihood has several maxima, the largest need not be where the posterior has any mass;
     it is then not found. Maxima less than two nats lower are named in the notes, but not those
@@ -157,7 +161,9 @@ def maximum_likelihood(
         n_evaluations += len(x)
         return factors.evaluate(x, rng)
 
-    x = population_of(model, rng, progressbar=progressbar)[0].x[::N_SWEEPS]
+    # The searches follow the gradient themselves: the population need not.
+    found, _ = population_of(model, rng, progressbar=progressbar, settles=False)
+    x = found.x[::N_SWEEPS]
     population = Population(x, *evaluate(x))
 
     def maximize(log_likelihood: BatchFunction, population: Population) -> Peak:
@@ -165,16 +171,26 @@ def maximum_likelihood(
             return maximize_estimated(log_likelihood, population, rng)
         return maximize_smooth(log_likelihood, population)
 
-    def log_likelihood(x: Array) -> Array:
+    def values(x: Array) -> Array:
         return evaluate(x)[1]
 
+    def with_slopes(x: Array) -> tuple[Array, Array]:
+        nonlocal n_evaluations
+        n_evaluations += len(x)
+        assert slopes is not None
+        return slopes(x)
+
+    slopes = factors.with_slopes() if x.shape[1] >= MANY_DIMENSIONS else None
+    log_likelihood = values if slopes is None else WithGradient(values, with_slopes)
     stepped = _is_stepped(model)
-    if stepped.any():
-        peak = maximize_stepped(
-            log_likelihood, population, stepped, maximize, is_noisy=factors.is_noisy
-        )
-    else:
-        peak = maximize(log_likelihood, population)
+    with row_progress(factors.likelihood.calls, enabled=progressbar) as announce:
+        announce("Maximising the likelihood", TYPICAL_EVALUATIONS * (x.shape[1] + 1) ** 2)
+        if stepped.any():
+            peak = maximize_stepped(
+                log_likelihood, population, stepped, maximize, is_noisy=factors.is_noisy
+            )
+        else:
+            peak = maximize(log_likelihood, population)
     return _described(model, peak, population.x, n_evaluations)
 
 

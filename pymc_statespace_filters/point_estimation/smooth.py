@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from ..evidence.estimators.maximum_likelihood import maximize_along_edge
-from ..evidence.estimators.newton import BatchFunction, EdgeError, derivatives, newton_maximize
+from ..evidence.estimators.newton import (
+    BatchFunction,
+    EdgeError,
+    along,
+    derivatives,
+    newton_maximize,
+)
 from ..sampling.starts.annealing import Population
 from .estimate import EDGE, INCREASING, LEVEL, Lost, Peak, unconstrained_hessian
 
@@ -60,10 +66,10 @@ def maximize_smooth(log_likelihood: BatchFunction, population: Population) -> Pe
     found = []
     for start in _starts(population, spread):
         scale = _fitting(log_likelihood, start, spread)
-        largest = newton_maximize(_along(log_likelihood, start, scale), np.zeros(len(start)))
+        largest = newton_maximize(along(log_likelihood, start, scale), np.zeros(len(start)))
         z, value = largest.point, largest.value
         if largest.at_edge:
-            value, z = maximize_along_edge(_along(log_likelihood, start, scale), z)
+            value, z = maximize_along_edge(along(log_likelihood, start, scale), z)
         found.append((value, start + scale @ z))
     _, point = max(found, key=lambda one: one[0])
     peak = _peak(log_likelihood, point, spread)
@@ -113,11 +119,6 @@ def _starts(population: Population, spread: Array) -> Array:
         taken.append(best)
         free &= np.linalg.norm(z - z[best], axis=1) > far
     return population.x[taken]
-
-
-def _along(function: BatchFunction, point: Array, scale: Array) -> BatchFunction:
-    """The function in coordinates z of x = point + scale z."""
-    return lambda z: function(point + z @ scale.T)
 
 
 def _fitting(function: BatchFunction, point: Array, scale: Array) -> Array:
@@ -185,11 +186,11 @@ def _refined(function: BatchFunction, point: Array, scale: Array, spread: Array)
     local = _derivatives_at(function, point, scale)
     for i in range(N_REFINED):
         curvature, directions = local.spectrum()
-        along = directions.T @ local.gradient / np.clip(np.abs(curvature), *RESCALING)
-        sure = np.where(curvature > MIN_CURVATURE, along, 0.0)
+        newton = directions.T @ local.gradient / np.clip(np.abs(curvature), *RESCALING)
+        sure = np.where(curvature > MIN_CURVATURE, newton, 0.0)
         if i >= N_RESCALED and np.linalg.norm(sure) < SETTLED:
             break
-        steps = np.stack([np.zeros_like(sure), *map(_shortened, (along, sure))])
+        steps = np.stack([np.zeros_like(sure), *map(_shortened, (newton, sure))])
         points = local.point + steps @ directions.T @ local.scale.T
         values = function(points)
         # the steps of the last digits change the value by rounding errors alone
@@ -208,8 +209,8 @@ def _shortened(step: Array) -> Array:
 def _derivatives_at(function: BatchFunction, point: Array, scale: Array) -> _Local:
     """Derivatives by differences with two steps, extrapolated to fourth order."""
     value = float(function(point[None])[0])
-    along, origin = _along(function, point, scale), np.zeros(scale.shape[1])
-    (fine_g, fine), (coarse_g, coarse) = (derivatives(along, origin, h) for h in (STEP, 2 * STEP))
+    scaled, origin = along(function, point, scale), np.zeros(scale.shape[1])
+    (fine_g, fine), (coarse_g, coarse) = (derivatives(scaled, origin, h) for h in (STEP, 2 * STEP))
     gradient, hessian = (4 * fine_g - coarse_g) / 3, (4 * fine - coarse) / 3
     ruggedness = float(np.abs(coarse - fine).max(initial=0.0))
     return _Local(point, value, scale, gradient, hessian, ruggedness)

@@ -104,8 +104,8 @@ class RowFunction:
     """A scalar function of a model's free variables, compiled over their flat vector.
 
     ``output`` is a scalar graph of the model's value variables; the noise seeds become arguments.
-    ``extra`` are graphs that `calls` evaluates, too. The variables of the graphs may be others,
-    those of ``point``.
+    ``extra`` are graphs that `calls` evaluates, too, and the gradient, if wanted, is its last
+    result. The variables of the graphs may be others, those of ``point``.
 
     Attributes
     ----------
@@ -123,6 +123,8 @@ class RowFunction:
         output: TensorVariable,
         extra: Sequence[TensorVariable] = (),
         point: Mapping[TensorVariable, Array] | None = None,
+        *,
+        with_gradient: bool = False,
     ) -> None:
         shared = noise_seeds(model)
         self.seed_names = tuple(shared)
@@ -132,7 +134,9 @@ class RowFunction:
             start = model.initial_point()
         else:
             values, start = list(point), {value.name: at for value, at in point.items()}
-        function, vector = compile_raveled(start, [output, *extra], values, shared)
+        function, vector = compile_raveled(
+            start, [output, *extra], values, shared, with_gradient=with_gradient
+        )
         example = [vector, *self.model_seeds]
         self.calls = Rows(native_function(function, example), len(example))
 

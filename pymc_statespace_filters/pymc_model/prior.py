@@ -1,6 +1,6 @@
 """The prior of a model on its unconstrained space: support, log-density, draws; likelihood."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 from pymc.distributions.continuous import FlatRV, HalfFlatRV
 from pymc.distributions.multivariate import ICARRV
 from pymc.pytensorf import compile as compile_pymc
+from pytensor.gradient import NullTypeGradError
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.random.basic import UniformRV
 from pytensor.tensor.variable import TensorVariable
 
-from ..errors import ModelError
+from ..errors import GradientUnavailableError, ModelError
 from .density import RowFunction, check_free_variables
 from .prior_draws import PriorDraws
 
@@ -200,10 +201,9 @@ class ModelFactors:
 
     def __init__(self, model: pm.Model) -> None:
         check_free_variables(model)
-        self.prior = ModelPrior(model)
-        self.likelihood = RowFunction(
-            model, model.logp(vars=[*model.observed_RVs, *model.potentials])
-        )
+        self.prior, self._model = ModelPrior(model), model
+        self._graph = model.logp(vars=[*model.observed_RVs, *model.potentials])
+        self.likelihood = RowFunction(model, self._graph)
 
     @property
     def is_noisy(self) -> bool:
@@ -216,6 +216,25 @@ class ModelFactors:
         A noisy likelihood is estimated with fresh noise at every point.
         """
         return self.evaluate_with(x, self.seeds(len(x), rng))
+
+    def with_slopes(self) -> Callable[[Array], tuple[Array, Array]] | None:
+        """A function that gives log-likelihoods (m,) and gradients (m, k) at points (m, k).
+
+        None if the likelihood is noisy, or has no gradient.
+        """
+        if self.is_noisy:
+            return None
+        try:
+            calls = RowFunction(self._model, self._graph, with_gradient=True).calls
+        except (GradientUnavailableError, NotImplementedError, NullTypeGradError):
+            return None
+
+        def found(x: Array) -> tuple[Array, Array]:
+            log_likelihood, slopes = calls(x)
+            inside = np.isfinite(self.prior.log_density(x)) & np.isfinite(log_likelihood)
+            return np.where(inside, log_likelihood, -np.inf), slopes
+
+        return found
 
     def seeds(self, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
         """Fresh seeds of the noise, a row for each point."""

@@ -10,7 +10,10 @@ from scipy.stats import chi2, multinomial, norm
 import pymc_statespace_filters as psf
 from benchmarks.posteriors import HARDENING, narrow
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.evidence.estimators.newton import WithGradient
+from pymc_statespace_filters.point_estimation.smooth import maximize_smooth
 from pymc_statespace_filters.pymc_model.prior import ModelFactors
+from pymc_statespace_filters.sampling.starts.annealing import Population
 from pymc_statespace_filters.testing import kalman_log_likelihood
 from tests.systems import autoregression, simulated
 
@@ -124,6 +127,37 @@ class TestAutoregression:
         assert abs(difference) < 4 * found.log_likelihood_se
         assert "quadratic" in found.notes[0]
         assert "simulation_error" in found.summary()
+
+
+def test_a_known_gradient_takes_few_evaluations():
+    """A skewed peak of 14 correlated parameters; its curvature at the maximum is known."""
+    rng = np.random.default_rng(1)
+    mixed = rng.standard_normal((14, 14)) + 3 * np.eye(14)
+    n_values, n_slopes = 0, 0
+
+    def values(x):
+        nonlocal n_values
+        n_values += len(x)
+        z = (x - 1.0) @ mixed.T
+        return -50.0 * (np.exp(z) - z - 1.0).sum(axis=1)
+
+    def with_slopes(x):
+        nonlocal n_slopes
+        n_slopes += len(x)
+        z = (x - 1.0) @ mixed.T
+        return -50.0 * (np.exp(z) - z - 1.0).sum(axis=1), -50.0 * (np.exp(z) - 1.0) @ mixed
+
+    x = 1.0 + 0.2 * rng.standard_normal((256, 14)) @ np.linalg.inv(mixed).T
+    population = Population(x, np.zeros(256), values(x))
+    peak = maximize_smooth(WithGradient(values, with_slopes), population)
+    np.testing.assert_allclose(peak.point, 1.0, atol=1e-7)
+    covariance = np.linalg.inv(50.0 * mixed.T @ mixed)
+    np.testing.assert_allclose(peak.basis @ peak.basis.T, covariance, rtol=1e-4, atol=1e-9)
+    assert n_values < 3000
+    assert n_slopes < 600
+    by_slopes, n_values = n_values, 0
+    assert maximize_smooth(values, population).value == pytest.approx(peak.value, abs=1e-9)
+    assert n_values > 3 * (by_slopes + n_slopes)
 
 
 def test_a_narrow_oscillator():

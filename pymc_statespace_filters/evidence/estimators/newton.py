@@ -1,7 +1,9 @@
 """Maximise a smooth function by a trust-region Newton method with finite differences.
 
 The coordinates are scaled such that the posterior draws have unit variance. Above fifty parameters
-the Hessian is not formed; only its products with directions are computed.
+the Hessian is not formed; only its products with directions are computed. Where the gradient is
+known, the Hessian is its difference at the start, and then follows the gradient (the symmetric
+update of rank one: Conn, Gould and Toint 1991, Math. Program. 50, 177-195).
 """
 
 from collections.abc import Callable
@@ -14,12 +16,59 @@ from scipy.optimize import minimize
 STEP = 0.01  # of the differences, in standard deviations of the draws
 MAX_GRADIENT = 1e-4  # nats per standard deviation
 MAX_ITERATIONS = 100
+MIN_UPDATE = 1e-8  # cosine between a move and what the Hessian lacks along it
 MAX_DENSE = 50  # parameters; above, Hessian-vector products replace the Hessian
 # Stop after MAX_IDLE steps in a row that gain less: on a ridge the gradient may never vanish.
 MIN_GAIN, MAX_IDLE = 1e-7, 5
 
 Array = NDArray[np.float64]
 BatchFunction = Callable[[Array], Array]
+
+
+class WithGradient:
+    """A function of points whose gradient is known.
+
+    ``with_slopes`` gives values (m,) and gradients (m, k) at points (m, k).
+    """
+
+    def __init__(
+        self, values: BatchFunction, with_slopes: Callable[[Array], tuple[Array, Array]]
+    ) -> None:
+        self._values, self.with_slopes = values, with_slopes
+
+    def __call__(self, x: Array) -> Array:
+        """Values (m,) alone."""
+        return self._values(x)
+
+    def slopes(self, x: Array) -> Array:
+        """Gradients (m, k).
+
+        Raises
+        ------
+        EdgeError
+            If the function is not finite at one of the points.
+        """
+        values, found = self.with_slopes(x)
+        if not (np.isfinite(values).all() and np.isfinite(found).all()):
+            raise EdgeError
+        return found
+
+
+def along(function: BatchFunction, point: Array, scale: Array) -> BatchFunction:
+    """The function in coordinates z of x = point + scale z."""
+
+    def values(z: Array) -> Array:
+        return function(point + z @ scale.T)
+
+    if not isinstance(function, WithGradient):
+        return values
+    with_slopes = function.with_slopes
+
+    def scaled(z: Array) -> tuple[Array, Array]:
+        found, slopes = with_slopes(point + z @ scale.T)
+        return found, slopes @ scale
+
+    return WithGradient(values, scaled)
 
 
 class Maximum(NamedTuple):
@@ -44,7 +93,7 @@ def derivatives(function: BatchFunction, point: Array, step: float) -> tuple[Arr
     """Gradient (k,) and Hessian (k, k) by central differences; k (k + 1) + 1 points in one call.
 
     A mixed derivative takes only two further points, f(x + h e_i + h e_j) and f(x - h e_i - h e_j),
-    beside the points along the axes.
+    beside the points along the axes. The differences of a known gradient take 2 k + 1 points.
 
     Raises
     ------
@@ -53,6 +102,11 @@ def derivatives(function: BatchFunction, point: Array, step: float) -> tuple[Arr
     """
     k = len(point)
     axes = step * np.eye(k)
+    if isinstance(function, WithGradient):
+        here, *around = function.slopes(point + np.concatenate([np.zeros((1, k)), axes, -axes]))
+        ahead, behind = np.reshape(around, (2, k, k))
+        hessian = (ahead - behind) / (2 * step)
+        return here, 0.5 * (hessian + hessian.T)
     i, j = np.triu_indices(k, 1)
     diagonals = axes[i] + axes[j]
     offsets = np.concatenate([np.zeros((1, k)), axes, -axes, diagonals, -diagonals])
@@ -70,13 +124,15 @@ def derivatives(function: BatchFunction, point: Array, step: float) -> tuple[Arr
 
 
 def gradient(function: BatchFunction, point: Array, step: float) -> Array:
-    """Gradient (k,) by central differences; 2 k points in one call.
+    """Gradient (k,), known or by central differences; 2 k points in one call.
 
     Raises
     ------
     EdgeError
         If the function is not finite at one of the points.
     """
+    if isinstance(function, WithGradient):
+        return function.slopes(point[None])[0]
     axes = step * np.eye(len(point))
     values = function(np.concatenate([point + axes, point - axes]))
     if not np.isfinite(values).all():
@@ -132,6 +188,7 @@ class _Search:
         self.best = Maximum(start, -np.inf, at_edge=False)
         self._previous, self._n_idle = -np.inf, 0
         self._known: dict[bytes, tuple[Array, Array]] = {}
+        self._last: tuple[Array, Array, Array] | None = None  # point, gradient, Hessian
 
     def objective(self, z: Array) -> float:
         """Minus the function."""
@@ -150,8 +207,22 @@ class _Search:
 
     def _derivatives(self, z: Array) -> tuple[Array, Array]:
         if z.tobytes() not in self._known:  # SciPy asks for the two one after the other
-            self._known = {z.tobytes(): derivatives(self._function, z, STEP)}
+            self._known = {z.tobytes(): self._found(z)}
         return self._known[z.tobytes()]
+
+    def _found(self, z: Array) -> tuple[Array, Array]:
+        """By differences, or those of the last point updated by a known gradient."""
+        if self._last is None or not isinstance(self._function, WithGradient):
+            slope, hessian = derivatives(self._function, z, STEP)
+        else:
+            before, slope_before, hessian = self._last
+            slope, move = self._function.slopes(z[None])[0], z - before
+            rest = slope - slope_before - hessian @ move
+            along_move = float(rest @ move)
+            if abs(along_move) > MIN_UPDATE * np.linalg.norm(rest) * np.linalg.norm(move):
+                hessian = hessian + np.outer(rest, rest) / along_move
+        self._last = z.copy(), slope, hessian
+        return slope, hessian
 
     def stop_if_idle(self, _: Array) -> None:
         """Stop after `MAX_IDLE` iterations in a row without a gain."""

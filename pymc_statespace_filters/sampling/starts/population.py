@@ -59,9 +59,11 @@ _PRIOR_WEIGHT = 0.2
 
 
 def population_of(
-    model: Model, rng: np.random.Generator, *, progressbar: bool
+    model: Model, rng: np.random.Generator, *, progressbar: bool, settles: bool = True
 ) -> tuple[Points, RaveledVariables]:
     """Points distributed nearly as a model's posterior, and their coordinates.
+
+    In many dimensions they are some nats below it if they do not settle along the gradient.
 
     Raises
     ------
@@ -79,7 +81,8 @@ def population_of(
         )
     target = Target(model, None, RandomWalkSettings())
     target.prepare()
-    return find_population(target, rng, progressbar=progressbar), target.raveled
+    found = find_population(target, rng, progressbar=progressbar, settles=settles)
+    return found, target.raveled
 
 
 def find_population(
@@ -89,6 +92,7 @@ def find_population(
     progressbar: bool,
     n_points: int = N_POINTS,
     pilot: Array | None = None,
+    settles: bool = True,
 ) -> Points:
     """Points distributed nearly as the posterior, ``n_points`` in each of the last sweeps.
 
@@ -99,7 +103,15 @@ def find_population(
     ModelError
         If no draw of the prior has a positive likelihood, or if the model fits the record exactly.
     """
-    search = partial(_search, target, rng, progressbar=progressbar, n_points=n_points, pilot=pilot)
+    search = partial(
+        _search,
+        target,
+        rng,
+        progressbar=progressbar,
+        n_points=n_points,
+        pilot=pilot,
+        settles=settles,
+    )
     found = None
     if (coarse := target.coarse_density()) is not None:
         found = _evaluated(target, search(coarse), rng, progressbar=progressbar)
@@ -129,6 +141,7 @@ def _search(
     progressbar: bool,
     n_points: int,
     pilot: Array | None,
+    settles: bool,
 ) -> Points:
     """Points distributed nearly as a log-density, that of the target or a coarse one."""
     led = _led_by_gaussian(target, rng, progressbar=progressbar) if pilot is None else None
@@ -151,7 +164,7 @@ def _search(
         if found is None:
             raise ModelError(_nowhere(target, density, drawn[0].x, rng))
         x, log_density = found.x, found.log_first + found.log_ratio
-    if settled := _settled(target, x, rng, of_pilot=False, progressbar=progressbar):
+    if settles and (settled := _settled(target, x, rng, of_pilot=False, progressbar=progressbar)):
         x, log_density = settled
     return Points(x, log_density, find_modes(x, lambda x: full(x)[1], rng))
 
