@@ -318,6 +318,12 @@ class TestRefusals:
             pm.Potential("never", pt.switch(x > 100.0, 0.0, -np.inf))
         self.refused("zero at all of 2000 draws", model=model)
 
+    def test_a_prior_far_from_the_data(self):
+        with pm.Model() as model:
+            mu = pm.Normal("mu", 0.0, 1.0)
+            pm.Normal("y", mu, 1.0, observed=[1e8, 1e8 + 1.0])
+        self.refused("the prior and the data contradict each other", model=model, random_seed=1)
+
     def test_other_arguments(self):
         self.refused("model must be a pymc.Model, got str", model="model")
         with pm.Model() as model:

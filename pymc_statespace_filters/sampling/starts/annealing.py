@@ -16,14 +16,17 @@ An estimated likelihood is kept with its point, and a proposal gets fresh noise.
 
 import math
 from collections.abc import Callable
+from itertools import count
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...errors import ModelError
 from ...importance import systematic
 from ...smc.temperature import next_temperature
 
+_PATIENCE, _LEAST_REACHED = 100, 1e-3  # temperatures; the last of them
 _ESS_FRACTION = 0.5  # left by a step of the temperature
 _MOVES = 3  # at each temperature
 N_SWEEPS = 3  # as many moves again and again, at the last temperature
@@ -55,9 +58,24 @@ def anneal(
     ``log_densities`` gives the log-density of the first and the log-ratio at points (m, k). At
     least one draw must have a positive ratio. Gives N_SWEEPS times ``n`` points: the population
     after every third of the last moves.
+
+    Raises
+    ------
+    ModelError
+        If the distributions lie too far apart.
     """
     temperature, scale = 0.0, 1.0
-    while temperature < 1.0:
+    for step in count():
+        if temperature == 1.0:
+            break
+        if step == _PATIENCE and temperature < _LEAST_REACHED:
+            raise ModelError(
+                "the prior and the data contradict each other: after "
+                f"{step} steps from the prior towards the posterior the power of the likelihood is "
+                f"{temperature:.1g}, where 1 is the posterior, which must lie thousands of the "
+                "prior's standard deviations away. Compare the units of data and priors, or give "
+                "wider priors"
+            )
         log_ratio = population.log_ratio
         raised = next_temperature(temperature, log_ratio, _ESS_FRACTION)
         weights = np.exp((raised - temperature) * (log_ratio - log_ratio.max()))
