@@ -8,6 +8,7 @@ from xarray import DataTree
 from ...pymc_model.density import ModelDensity
 from ...pymc_model.posterior_draws import noise_was_moved, unconstrained_draws
 from ..target.initial_points import PriorDraws
+from .signs import signs_message
 from .warnings import sampler_warning
 
 # CPU seconds: so many, or this share of the time of the run if that is more.
@@ -48,4 +49,8 @@ def unvisited_warnings(
     wide = prior.draws if prior.is_prior and len(prior.draws) > 1 else None
     found = unvisited(model, draws, log_density, evaluate, seconds, rng, wide)
     store(tree, found)
+    if not density.seed_names:
+        flat = draws.reshape(-1, draws.shape[-1])
+        sign = signs_message(model, flat, lambda x: evaluate(x, rng))
+        found = found if sign is None else [sign, *found]
     return [sampler_warning(f"{text[0].upper()}{text[1:]}.") for text in found]

@@ -1,0 +1,39 @@
+"""Parameters whose sign has no meaning, though the draws have both: a scale with a normal prior."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from pymc.model import Model
+from pytensor.graph.traversal import ancestors
+
+from ...pymc_model.elements import Elements
+from ...pymc_model.inspection import state_space_nodes
+
+_LEAST_SHARE = 0.02  # of the draws, with the rarer sign
+_N_POINTS = 8
+
+Array = NDArray[np.float64]
+
+
+def signs_message(model: Model, draws: Array, evaluate: Callable[[Array], Array]) -> str | None:
+    """Name an element of draws (n, k) with the same density at the opposite sign, if there is one.
+
+    Only variables that a StateSpace variable depends on: others may well be symmetric.
+    """
+    parameters = [node.inputs[-5] for node in state_space_nodes(model).values()]
+    used = {rv.name for rv in set(model.free_RVs) & set(ancestors(parameters))}
+    elements, negative = Elements.of(model), (draws < 0).mean(axis=0)
+    x = draws[np.linspace(0, len(draws) - 1, _N_POINTS).astype(int)]
+    for i, share in enumerate(negative):
+        if elements.variables[i] not in used or min(share, 1 - share) < _LEAST_SHARE:
+            continue
+        opposite = x * np.where(np.arange(x.shape[1]) == i, -1.0, 1.0)
+        if np.allclose(evaluate(x), evaluate(opposite), rtol=1e-9, atol=0.0):
+            name = elements.labels[i]
+            return (
+                f"the density is the same at {name} and -{name}, and {share:.0%} of the draws are "
+                f"negative, so that the mean and the intervals of {name} say nothing of its size. "
+                f"If {name} is a scale, give it a positive prior, such as pm.HalfNormal"
+            )
+    return None
