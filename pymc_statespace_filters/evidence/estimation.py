@@ -283,7 +283,9 @@ def estimate_evidence(
     With `filter`, the mean of prior times estimated likelihood over the density of the proposals is
     unbiased, and the noise of the estimates is part of the standard error (Tran, Scharth, Pitt and
     Kohn 2013). The proposals are fitted to at most 1000 draws, corrected as by `reweight`, which
-    takes about 2000 evaluations. An estimate stored before by the same estimator is replaced.
+    takes about 2000 evaluations, and up to 11 000 of a noisy filter. The filter is then checked as
+    by `reweight`; what is found is among the ``doubts``. An estimate stored before by the same
+    estimator is replaced.
 
     References
     ----------

@@ -56,6 +56,8 @@ class Posterior:
     population : ndarray of int (chain, draw), optional
         The population of each draw, if they are particles: see `are_populations`. The draws of one
         have common ancestors, so that only populations are independent.
+    remedy : str
+        What else may help where proposals that are fitted to the draws are poor.
     shared_seed : tuple of int, optional
         Seed of the points whose log-densities several estimators use. Without it each estimator
         evaluates points of its own.
@@ -70,6 +72,7 @@ class Posterior:
     prior: Prior | None = None
     failures: Callable[[Array], Counter[Failure]] | None = None
     population: NDArray[np.int64] | None = None
+    remedy: str = "use bridge sampling"
     shared_seed: tuple[int, ...] | None = None
     shared: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 

@@ -1,6 +1,7 @@
 """Run estimators on the draws of a model and turn each `Estimate` into an `Evidence`."""
 
 import math
+import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -13,9 +14,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..errors import INSIDE, EvidenceWarning, ModelError
+from ..filter_checks.checks import MORE_POINTS, check_at_end, doubts
 from ..filter_checks.checks import stored as stored_filter_checks
 from ..filter_checks.finding import OFF
 from ..filters.protocol import Filter
+from ..filters.recommendation import short_form
 from ..parallel.shared_rows import by_first_rank
 from ..progress import row_progress
 from ..pymc_model.density import ModelDensity
@@ -42,6 +45,7 @@ CORRECTION = "correction of the draws"
 SHARED = "shared proposals"
 UNVISITED = "unvisited tails"
 LABELS = "exchangeable labels"
+FILTER = "check of the filter"
 # CPU seconds for the search for tails that the chains have missed; fewest draws that it needs.
 CHECK_SECONDS, LEAST_DRAWS = 1.0, 4000
 LESS_CERTAIN = "{} is less certain than its standard error suggests"
@@ -70,6 +74,7 @@ def run_estimators(
         each estimator that cannot treat the model while another can.
     """
     model = model_of_draws(model, idata)
+    began = time.process_time()
     posterior_group(idata)  # fails early, before anything is compiled
     exact = None if filter is None else ExactDensity(model, filter)
     density = ModelDensity(model, moved=noise_was_moved(idata))
@@ -97,6 +102,10 @@ def run_estimators(
         if exact is not None:
             noise = "refreshed" if exact.n_noisy else "none"
             posterior = exact_posterior(posterior, exact, stream(CORRECTION), announce)
+            seconds = time.process_time() - began
+            off = _doubts_of_filter(exact, posterior, seconds, stream(FILTER))
+            common, remedy = (*common, *off), _remedy(exact.filter, is_off=bool(off))
+            posterior = replace(posterior, remedy=remedy)
         estimates, refusals = _estimates(estimators, posterior, stream, announce)
         announce(MAXIMUM, N_EVALUATIONS)
         rng = stream(MAXIMUM)
@@ -141,6 +150,24 @@ def _missed(
         return []
     parts = posterior.draws, posterior.log_density, posterior.evaluate
     return by_first_rank(lambda: unvisited(model, *parts, CHECK_SECONDS, rng))
+
+
+def _doubts_of_filter(
+    exact: ExactDensity, posterior: Posterior, seconds: float, rng: np.random.Generator
+) -> list[str]:
+    """What is wrong with the filter that replaces those of the model, at the corrected draws."""
+    draws = posterior.draws.reshape(-1, posterior.draws.shape[-1])
+    given = draws, exact.model, exact.filter, seconds, rng, MORE_POINTS
+    return doubts(by_first_rank(lambda: check_at_end(*given)))
+
+
+def _remedy(filter: Filter, *, is_off: bool) -> str:
+    """What helps where proposals are poor for the estimates by another filter."""
+    if is_off:
+        return f"use another filter than {short_form(filter)}"
+    if filter.noisy:
+        return f"give {short_form(filter)} more particles"
+    return f"draw from the model with {short_form(filter)}"
 
 
 def _where_reached(

@@ -16,7 +16,7 @@ from scipy.special import chdtri, stdtrit
 from ..filters.recommendation import short_form
 from .estimates import Comparison, Estimates
 from .finding import ALPHA, FINE, OFF, TOLERATED, UNDECIDED, VISIBLE, Finding, cure, nats
-from .low import shortfall
+from .low import shortfall, without_likelihood
 from .points import Points
 
 Array = NDArray[np.float64]
@@ -55,12 +55,14 @@ class _Difference(NamedTuple):
 def bias_at_draws(found: Comparison, points: Points, names: Sequence[str]) -> list[Finding]:
     """Compare an approximate filter with the likelihood at the points, of which some are draws."""
     draws = found.at(points.spread == 1.0)
+    if (lost := without_likelihood(draws, "bias", "at draws")) is not None:
+        return [lost]
     name, reference = short_form(found.checked.filter), reference_of(draws)
     if reference is None:
         return [_without_reference(draws, name)]
     bias = _difference(draws.checked, reference)
     if bias.n < 2:
-        verdict = f"undecided whether {name} is off: it failed, or its reference did, at the draws"
+        verdict = f"undecided whether {name} is off: {short_form(reference.filter)} fails at draws"
         return [Finding("bias", np.nan, np.nan, ALPHA, np.inf, UNDECIDED, verdict)]
     moved = _shifts(found, points, names, reference)
     visible = abs(bias.mean) + bias.margin
@@ -97,6 +99,9 @@ def bias_elsewhere(found: Comparison, draws: Comparison) -> Finding | None:
 
     Lower by more than what is usual between draws. None if that is not known.
     """
+    lost = without_likelihood(found, "bias elsewhere", "at points as likely as its draws")
+    if lost is not None:
+        return lost
     reference = reference_of(draws)
     if reference is None:
         return None
@@ -148,12 +153,12 @@ def _without_reference(draws: Comparison, name: str) -> Finding:
 
 
 def _undecided(draws: Comparison, name: str) -> str:
-    if draws.plain is None:
-        return f"undecided whether {name} is off: no unbiased filter takes this system"
-    text = (
-        f"undecided whether {name} is off: plain particles, {short_form(draws.plain.filter)}, "
-        f"scatter by {nats(draws.plain.scatter)} nats"
-    )
+    text = f"undecided whether {name} is off: no filter without a guide takes this system"
+    if draws.plain is not None:
+        text = (
+            f"undecided whether {name} is off: plain particles, {short_form(draws.plain.filter)}, "
+            f"scatter by {nats(draws.plain.scatter)} nats"
+        )
     for one in draws.guided:
         gap = float(np.median(draws.checked.mean - one.mean))
         text += (

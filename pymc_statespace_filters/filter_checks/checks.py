@@ -1,7 +1,8 @@
 """The checks of all StateSpace variables of a model at draws of its posterior."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,11 @@ _ORDER = (OFF, UNDECIDED, FINE, EXACT)
 # Nats by which a point may be less likely than the draws, beside the volume where it lies.
 _SLACK = 3.0
 _MOST_DRAWS = 500  # of each chain, from which mean and spread are taken
+# Of the check at the end of a calculation: points, and CPU seconds for them, or the share of those
+# of the calculation if that is more.
+N_POINTS, LEAST_SECONDS, _SHARE = 20, 2.0, 0.1
+# Points for a filter that corrects draws: it may be too low at few of them.
+MORE_POINTS = 40
 
 
 def _needs_check(system: Any, filter: Filter) -> bool:
@@ -74,6 +80,40 @@ def check_model(
     ``filter`` is checked in their place; None: their own. ``seconds`` of CPU time are for all
     variables together.
     """
+    find_draws = partial(_draws_of, idata, model)
+    return _check_at(find_draws, model, filter, n_points, seconds, rng, progressbar=progressbar)
+
+
+def check_at_end(
+    draws: xr.DataTree | Array,
+    model: pm.Model,
+    filter: Filter | None,
+    seconds: float,
+    rng: np.random.Generator,
+    n_points: int = N_POINTS,
+) -> dict[str, dict[str, str]]:
+    """The outcomes for all variables, at the end of a calculation that took so many CPU seconds.
+
+    At its result, or at draws (n, k) of the unconstrained space.
+    """
+    find_draws = (
+        partial(_draws_of, draws, model) if isinstance(draws, xr.DataTree) else lambda: draws
+    )
+    seconds = max(LEAST_SECONDS * n_points / N_POINTS, _SHARE * seconds)
+    return outcomes_of(_check_at(find_draws, model, filter, n_points, seconds, rng))
+
+
+def _check_at(
+    find_draws: Callable[[], Array],
+    model: pm.Model,
+    filter: Filter | None,
+    n_points: int,
+    seconds: float,
+    rng: np.random.Generator,
+    *,
+    progressbar: bool = False,
+) -> pd.DataFrame:
+    """As `check_model`, at draws (n, k) that are looked for if there is something to check."""
     nodes = state_space_nodes(model)
     chosen = {
         name: filter or node.op.filter
@@ -85,7 +125,7 @@ def check_model(
     for name, one in chosen.items():
         check_system_and_filter(nodes[name].op.system, one)
     checked = {n for n, one in chosen.items() if _needs_check(nodes[n].op.system, one)}
-    draws = _draws_of(idata, model) if checked else np.empty((0, 0))
+    draws = find_draws() if checked else np.empty((0, 0))
     rows = []
     for name, one in chosen.items():
         if name in checked:
@@ -101,14 +141,7 @@ def check_model(
 
 
 def doubt_at(
-    model: pm.Model,
-    name: str,
-    filter: Filter,
-    draws: Array,
-    *,
-    n_points: int,
-    seconds: float,
-    rng: np.random.Generator,
+    model: pm.Model, name: str, filter: Filter, draws: Array, rng: np.random.Generator
 ) -> str | None:
     """What is wrong with a filter of a variable at draws (n, k) of the unconstrained space, if so.
 
@@ -116,8 +149,9 @@ def doubt_at(
     """
     if not _needs_check(state_space_nodes(model)[name].op.system, filter):
         return None
+    budget = Budget(LEAST_SECONDS)
     with np.errstate(invalid="ignore"):
-        findings = _check_variable(model, name, filter, draws, n_points, Budget(seconds), rng)
+        findings = _check_variable(model, name, filter, draws, N_POINTS, budget, rng)
     return next((one.verdict for one in findings if one.outcome == OFF), None)
 
 
@@ -158,8 +192,7 @@ def _is_relevant(
     model: pm.Model, name: str, points: Points, found: Comparison
 ) -> NDArray[np.bool_]:
     """Which other points the posterior would hold, by the highest of all estimates there."""
-    estimates = [found.checked, *found.unbiased, *([found.exact] if found.exact else [])]
-    highest = np.max([one.mean for one in estimates], axis=0)
+    highest = np.maximum(found.checked.mean, found.of_witnesses)
     density = highest + _density_of_others(model, name, points.x)
     factor = np.where(points.spread == 0.0, points.spread.max(), points.spread)
     allowed = _SLACK + points.x.shape[1] * np.log(factor)
@@ -187,8 +220,15 @@ def outcomes_of(table: pd.DataFrame) -> dict[str, dict[str, str]]:
 
 
 def store(idata: xr.DataTree, outcomes: Mapping[str, Mapping[str, str]]) -> None:
-    """Keep the outcomes with the draws; files of netCDF and Zarr store no mappings."""
-    idata.attrs[ATTRIBUTE] = json.dumps(outcomes)
+    """Keep the outcomes with the draws, which are not exact if a filter is off."""
+    idata.attrs[ATTRIBUTE] = json.dumps(outcomes)  # files of netCDF and Zarr store no mappings
+    if doubts(outcomes):
+        idata.attrs["exact"] = 0
+
+
+def doubts(outcomes: Mapping[str, Mapping[str, str]]) -> list[str]:
+    """What is wrong with the filters that are off, each with the name of its variable."""
+    return [f"{name}: {o['verdict']}" for name, o in outcomes.items() if o["outcome"] == OFF]
 
 
 def kept(former: xr.DataTree, filter: Filter) -> dict[str, dict[str, str]]:

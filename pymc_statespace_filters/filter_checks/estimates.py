@@ -95,6 +95,13 @@ class Comparison(NamedTuple):
         """The witnesses with noise."""
         return (*((self.plain,) if self.plain else ()), *self.guided)
 
+    @property
+    def of_witnesses(self) -> Array:
+        """The highest log-likelihood by a witness at each point, (m,)."""
+        witnesses = [*self.unbiased, *([self.exact] if self.exact else [])]
+        failed = np.full(len(self.checked.logs), -np.inf)
+        return np.max([failed, *(one.mean for one in witnesses)], axis=0)
+
     def at(self, rows: NDArray[np.bool_]) -> "Comparison":
         """The same at some of the points."""
         return Comparison(

@@ -7,6 +7,7 @@ import numpy as np
 
 from ..filters.bootstrap import BootstrapPF
 from ..filters.guided_pf import GuidedPF
+from ..filters.protocol import Filter
 from ..filters.rbpf import RBPF
 from ..filters.recommendation import short_form
 from ..pymc_model.inspection import resized
@@ -22,6 +23,9 @@ EXACT, FINE, OFF, UNDECIDED = "exact", "no sign", "off", "undecided"
 
 # The variance of an estimated log-likelihood with which a chain works well.
 _GOOD_VARIANCE = 1.8
+# Plain particles for a guided one, which takes about five times as long, up to which they are
+# preferred: nothing leads them astray.
+_AS_CHEAP = 10
 
 
 class Finding(NamedTuple):
@@ -46,25 +50,32 @@ def cure(found: Comparison) -> str:
     plain = found.plain if found.plain is not None and found.plain.is_usable else None
     if found.exact is not None and plain is None:
         return f"Use {short_form(found.exact.filter)}, which computes this likelihood."
+    is_enough = None if plain is None else _enough(plain)
     for one in found.guided:
         agrees = plain is None or abs(np.median(one.mean - plain.mean)) <= TOLERATED
-        if not isinstance(found.checked.filter, GuidedPF) and one.is_usable and agrees:
+        is_cheap = is_enough is None or _size(is_enough) > _AS_CHEAP * _size(one.filter)
+        of_guided = isinstance(found.checked.filter, GuidedPF)
+        if not of_guided and one.is_usable and agrees and is_cheap:
             others = "" if plain is None else " and agree with those of plain particles"
             return (
                 f"Use {short_form(one.filter)}: its estimates are unbiased, scatter by "
                 f"{nats(one.scatter)} nats here{others}."
             )
-    if plain is not None:
-        return f"Use {_enough(plain)}, whose estimates are unbiased."
+    if is_enough is not None:
+        return f"Use {short_form(is_enough)}, whose estimates are unbiased."
     return (
         "No filter is known to work here: BootstrapPF and GuidedPF are unbiased with any number of "
         "particles, but these were too few."
     )
 
 
-def _enough(plain: Estimates) -> str:
+def _size(filter: Filter) -> int:
+    assert isinstance(filter, BootstrapPF | RBPF | GuidedPF)
+    return filter.n_particles
+
+
+def _enough(plain: Estimates) -> Filter:
     """Plain particles in a number that suits a chain."""
-    assert isinstance(plain.filter, BootstrapPF | RBPF)
-    number = max(plain.filter.n_particles * plain.scatter**2 / _GOOD_VARIANCE, 100.0)
+    number = max(_size(plain.filter) * plain.scatter**2 / _GOOD_VARIANCE, 100.0)
     digit = 10 ** math.floor(math.log10(number))
-    return short_form(resized(plain.filter, digit * math.ceil(number / digit)))
+    return resized(plain.filter, digit * math.ceil(number / digit))

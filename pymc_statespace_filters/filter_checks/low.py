@@ -33,8 +33,29 @@ def shortfall(found: Comparison, bounds: NDArray[np.float64]) -> float:
     )
 
 
+def without_likelihood(found: Comparison, check: str, where: str) -> Finding | None:
+    """That the filter gives zero where another one proves that the likelihood is not, if so."""
+    lost = np.isneginf(found.checked.mean) & np.isfinite(found.of_witnesses)
+    if not lost.any():
+        return None
+    name = short_form(found.checked.filter)
+    verdict = (
+        f"{name} has no likelihood {where}: it is zero at {lost.sum()} of {lost.size} points, and "
+        f"not zero by {_best(found)}. {cure(found)}"
+    )
+    return Finding(check, -np.inf, np.nan, ALPHA, np.inf, OFF, verdict)
+
+
+def _best(found: Comparison) -> str:
+    """The witness that has the highest log-likelihoods."""
+    witnesses = [found.exact] if found.exact else [*found.unbiased]
+    return short_form(max(witnesses, key=lambda one: np.isfinite(one.mean).sum()).filter)
+
+
 def low_at(found: Comparison, where: str) -> Finding:
     """Test the estimates of an unbiased filter at some points, ``where`` in words."""
+    if (lost := without_likelihood(found, f"low {where}", where)) is not None:
+        return lost
     checked, name = found.checked, short_form(found.checked.filter)
     error = checked.typical_error
     proved = shortfall(found, checked.mean) - _N_ERRORS * error
@@ -85,8 +106,11 @@ def _visible(found: Comparison) -> float:
 
 
 def _why(found: Comparison) -> str:
-    if found.plain is None:
+    other = found.exact or found.plain
+    if other is None:
         return "no filter without a guide takes this system"
+    if found.plain is None or found.plain.scatter < found.checked.scatter:
+        return f"its own estimates scatter by {nats(found.checked.scatter)} nats"
     return (
         f"plain particles, {short_form(found.plain.filter)}, scatter by "
         f"{nats(found.plain.scatter)} nats"

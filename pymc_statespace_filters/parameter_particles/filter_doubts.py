@@ -6,8 +6,7 @@ import pymc as pm
 import xarray as xr
 from pymc.stats.convergence import log_warnings
 
-from ..filter_checks.checks import kept, store
-from ..filter_checks.finding import OFF
+from ..filter_checks.checks import doubts, kept, store
 from ..filters.protocol import Filter
 from ..parallel.shared_rows import by_first_rank
 from ..parallel.signals import unless_interrupted
@@ -46,9 +45,9 @@ def kept_from(former: xr.DataTree) -> DoubtsOf:
         if not (outcomes := kept(former, filter)):
             return ()
         store(tree, outcomes)
-        doubts = [f"{name}: {o['verdict']}" for name, o in outcomes.items() if o["outcome"] == OFF]
-        warn_of_filters(doubts)
-        return doubts
+        found = doubts(outcomes)
+        warn_of_filters(found)
+        return found
 
     return doubts_of
 

@@ -128,7 +128,7 @@ def test_weighted_draws_keep_their_populations():
     def evaluate(x, seeds):
         return posterior.evaluate(x, np.random.default_rng(1))[:, None]
 
-    found = correct(posterior, kept, evaluate, 0, np.random.default_rng(3))
+    found = correct(posterior, kept, evaluate, (1, 0), np.random.default_rng(3))
     np.testing.assert_array_equal(found.pooled.population, population[:, ::2])
     assert found.pooled.shape == (4, 100)
 

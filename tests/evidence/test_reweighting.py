@@ -2,6 +2,7 @@
 
 import json
 import re
+import warnings
 from functools import partial
 
 import arviz as az
@@ -14,8 +15,11 @@ from scipy.stats import multivariate_t, norm
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.evidence.pooled import Pooled
 from pymc_statespace_filters.evidence.posterior import Posterior
-from pymc_statespace_filters.evidence.reweighting.correction import correct
+from pymc_statespace_filters.evidence.reweighting.correction import correct, seeds_needed
 from pymc_statespace_filters.evidence.reweighting.reweight import _problems
+from pymc_statespace_filters.filter_checks import checks
+from pymc_statespace_filters.filter_checks.budget import Budget
+from pymc_statespace_filters.filter_checks.finding import Finding
 from tests.evidence.targets import Normals, autoregressive, log_normal
 from tests.systems import FREE, counts
 
@@ -103,7 +107,8 @@ def two_modes(run, k, distance, prior_sd, mass, noise=1.0, lower=20.0, n=1000):
     draws = centres[0] + rng.standard_normal((4, n // 4, k))
     stored = approximate(draws.reshape(-1, k), rng).reshape(4, -1)
     posterior = Posterior(draws, stored, approximate, prior=Normals([prior_sd] * k))
-    return correct(posterior, posterior, evaluate, 1, rng)
+    seeds_of_point = seeds_needed(posterior, evaluate, 1, rng), 1
+    return correct(posterior, posterior, evaluate, seeds_of_point, rng)
 
 
 def share_of_flagged(runs, *settings, **options):
@@ -301,6 +306,82 @@ def test_draws_that_lack_a_mode_are_said_to():
         found = reweight(idata, model, filter=psf.BootstrapPF(100), random_seed=8)
     assert found.attrs["beyond_draws"] > 0.3
     assert (found["posterior"]["a"] < 0).any()
+
+
+# A sensor that folds: x and -x - .3 explain its observation equally well, and a guide follows one.
+
+FOLDING = psf.StateSpaceModel(
+    transition=lambda x, q, a, s: [a * x[0] + 3 * x[0] / (1 + x[0] ** 2) + s * q[0]],
+    process_noise=[[1.0]],
+    observation=lambda x: [x[0] ** 2 + 0.3 * x[0]],
+    observation_noise=[[0.25]],
+    initial_mean=[0.5],
+    initial_cov=[[1.0]],
+)
+TIMES = range(1, 61)
+
+
+@pytest.fixture(scope="module")
+def folding():
+    """Draws by EKF from a grid, and their model."""
+    data = psf.simulate(FOLDING, {"a": 0.5, "s": 0.6}, steps=TIMES, random_seed=701)
+    with pm.Model() as model:
+        pm.Normal("a", 0.8, 0.4)
+        pm.HalfNormal("s", 1.0)
+        psf.StateSpace("d", FOLDING, psf.EKF(), steps=TIMES, observed=data["observations"])
+    a, s = (x.ravel() for x in np.meshgrid(np.linspace(0.35, 0.7, 40), np.linspace(0.2, 1.2, 40)))
+    at = psf.log_likelihood(
+        FOLDING, psf.EKF(), {"a": a, "s": s}, data["observations"].values, steps=TIMES
+    )
+    density = at.sum(axis=-1) + norm.logpdf(a, 0.8, 0.4) + norm.logpdf(s, 0, 1)
+    rng = np.random.default_rng(4)
+    drawn = (density + rng.gumbel(size=(4, 100, density.size))).argmax(axis=-1)
+    jitter = rng.uniform(-0.5, 0.5, (2, 4, 100))
+    values = {"a": a[drawn] + 0.35 / 39 * jitter[0], "s": s[drawn] + 1.0 / 39 * jitter[1]}
+    return az.from_dict({"posterior": values}), model
+
+
+@pytest.mark.filterwarnings("ignore:few weights decide", "ignore:.*where there are no draws")
+def test_a_plain_filter_is_right_where_a_guide_goes_astray(folding):
+    """Truth by a grid of points; to four errors each."""
+    found = reweight(*folding, filter=psf.BootstrapPF(200), n_draws=200, random_seed=5)
+    a, attrs = found["posterior"]["a"].values, found.attrs
+    assert abs(a.mean() - 0.5435) < 4 * 0.0546 * attrs["effective_size"] ** -0.5 < 0.04
+    assert abs(attrs["log_evidence"] + 152.708) < 4 * attrs["log_evidence_se"] < 0.6
+    assert attrs["exact"] == 1
+    assert json.loads(attrs["filter_check"])["d"]["outcome"] == "exact"
+
+
+def test_draws_are_chosen_where_each_needs_many_estimates(approximate, monkeypatch):
+    monkeypatch.setitem(_problems.__globals__, "MOST_ESTIMATES", 1600)
+    filter = psf.BootstrapPF(5)
+    found = reweight(approximate, model_of(psf.IPLF()), filter=filter, random_seed=5)
+    n_seeds, n_draws = found.attrs["n_seeds"], found["posterior"]["a"].size
+    assert n_seeds > 2
+    assert found.attrs["n_draws"] == n_draws == 4 * (1600 // n_seeds // 4)
+
+
+def test_a_filter_that_corrects_is_checked_like_one_that_draws(approximate, monkeypatch):
+    """Weights are in order whether it is right or follows one of two explanations."""
+    checked = []
+
+    def low(found, where):
+        checked.append(found.checked.filter)
+        return Finding(where, 0.0, 0.0, 0.01, 1.0, "off", f"a verdict {where}")
+
+    monkeypatch.setattr(checks, "low_at", low)
+    monkeypatch.setattr(Budget, "is_spent", True)
+    model, filter = model_of(psf.IPLF()), psf.GuidedPF(20)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = reweight(approximate, model, filter=filter, n_draws=80, random_seed=5)
+        (evidence,) = estimate_evidence(approximate, model, filter=filter).values()
+    assert set(checked) == {filter}
+    assert json.loads(found.attrs["filter_check"])["d"]["outcome"] == "off"
+    assert found.attrs["exact"] == 0
+    said = [str(one.message) for one in caught if "d: a verdict" in str(one.message)]
+    assert len(said) == 2
+    assert "d: a verdict" in evidence.doubts
 
 
 # Errors.

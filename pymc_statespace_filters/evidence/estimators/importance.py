@@ -30,7 +30,7 @@ import numpy as np
 from ...importance import MAX_PARETO_K, MIN_EFFECTIVE, log_mean_of_independent, pareto_k
 from ..posterior import Posterior, check_overlap
 from .protocol import Estimate
-from .stopping import check_target, is_small, shortfall, totals
+from .stopping import check_target, is_small, shortfall, stands_still, totals
 from .student_mixture import choose_mixture
 
 MOST_COMPARED = 10_000  # draws whose weights are compared with those of the proposals
@@ -44,7 +44,8 @@ class Importance:
     ----------
     target_se : float, optional
         Standard error to be reached. The number of proposals is doubled from 1000 to at most 16 000
-        until it is. By default it is the number of draws, within 1000 to 10 000.
+        until it is, or until their effective number is small and no longer grows. By default it is
+        the number of draws, within 1000 to 10 000.
 
     Examples
     --------
@@ -69,7 +70,7 @@ class Importance:
         compared = posterior.thinned(MOST_COMPARED)
         draws = compared.draws.reshape(-1, compared.draws.shape[-1])
         of_draws = compared.log_density.ravel() - q.log_density(draws)
-        log_weights = np.empty(0)
+        log_weights, n_effective = np.empty(0), 0.0
         for n_proposals in totals(posterior, self.target_se):
             proposals = q.sample(n_proposals - len(log_weights), rng)
             log_density = posterior.evaluate(proposals, rng)
@@ -78,10 +79,10 @@ class Importance:
             evidence = log_mean_of_independent(log_weights)
             unsampled = float((of_draws > log_weights.max()).mean())
             se = math.hypot(evidence.error, unsampled)
-            if is_small(self.target_se, 0.0, se):
+            former, n_effective = n_effective, evidence.kish_ess(n_proposals)
+            if is_small(self.target_se, 0.0, se) or stands_still(former, n_effective):
                 break
         tail = pareto_k(log_weights)
-        n_effective = evidence.kish_ess(n_proposals)
         return Estimate(
             log_evidence=evidence.value,
             se=se,
@@ -93,33 +94,35 @@ class Importance:
                 "unsampled": unsampled,
                 "zero_density": float(np.isneginf(log_weights).mean()),
             },
-            doubts=tuple(_check(n_effective, tail, unsampled, evidence.error)),
+            doubts=tuple(_check(n_effective, tail, unsampled, evidence.error, posterior.remedy)),
             shortfall=shortfall(
                 self.target_se,
                 0.0,
                 se,
                 posterior.log_density.size,
-                "draw more, for proposals that fit better, or use bridge sampling",
+                f"draw more, for proposals that fit better, or {posterior.remedy}",
             ),
         )
 
 
-def _check(n_effective: float, tail: float, unsampled: float, error: float) -> Iterator[str]:
+def _check(
+    n_effective: float, tail: float, unsampled: float, error: float, remedy: str
+) -> Iterator[str]:
     """Check the number of proposals, the tail of their weights, and those of the draws beyond."""
     if unsampled > error:
         yield (
             f"{unsampled:.1%} of the draws have a weight above that of every proposal: that part "
-            "of the posterior has not been sampled; use bridge sampling, or reparametrise towards "
-            "a Gaussian posterior"
+            f"of the posterior has not been sampled; {remedy}, or reparametrise towards a Gaussian "
+            "posterior"
         )
     if n_effective < MIN_EFFECTIVE:
         yield (
             f"the proposals have an effective number of {n_effective:.0f}, fewer than "
-            f"{MIN_EFFECTIVE}: use bridge sampling, or reparametrise towards a Gaussian posterior"
+            f"{MIN_EFFECTIVE}: {remedy}, or reparametrise towards a Gaussian posterior"
         )
     if not tail <= MAX_PARETO_K:
         yield (
             f"the largest weights have a heavy tail (Pareto k {tail:.2f}, above {MAX_PARETO_K}): "
-            "the posterior has mass where there are few draws, or a sharp edge; draw more, or use "
-            "bridge sampling"
+            "the posterior has mass where there are few draws, or a sharp edge; draw more, or "
+            f"{remedy}"
         )

@@ -23,7 +23,7 @@ from ...importance import MIN_EFFECTIVE, log_mean_of_independent
 from ...system.checks import check_count
 from ..posterior import Posterior
 from .protocol import Estimate
-from .stopping import check_target, is_small, shortfall, totals
+from .stopping import check_target, is_small, shortfall, stands_still, totals
 
 MIN_DRAWS = 100
 
@@ -67,19 +67,19 @@ class PriorMonteCarlo:
         ModelError
             If the prior is improper, or the likelihood is zero at all of its draws.
         """
-        log_likelihood = np.empty(0)
+        log_likelihood, n_effective = np.empty(0), 0.0
         for n_draws in self._totals(posterior):
             x = posterior.required_prior.sample(n_draws - len(log_likelihood), rng)
             log_likelihood = np.append(log_likelihood, posterior.evaluate_factors(x, rng)[1])
             evidence = log_mean_of_independent(log_likelihood)
-            if is_small(self.target_se, 0.0, evidence.error):
+            former, n_effective = n_effective, evidence.kish_ess(n_draws)
+            if is_small(self.target_se, 0.0, evidence.error) or stands_still(former, n_effective):
                 break
         if np.isneginf(evidence.value):
             raise ModelError(
                 f"the likelihood is zero at all {n_draws} draws of the prior: "
                 f"{posterior.why_zero(x)}"
             )
-        n_effective = evidence.kish_ess(n_draws)
         return Estimate(
             log_evidence=evidence.value,
             se=evidence.error,

@@ -9,6 +9,9 @@ than a twentieth with log-variance one.
 An error with two sources, the draws and the evaluations, is not reduced beyond the point where the
 evaluations contribute half as much as the draws: without them it would be a tenth smaller. If the
 draws' error alone exceeds the target, whatever the evaluations, they stop at its size.
+
+Where the effective number of the terms is small and does not grow with theirs, their tail is so
+long that further ones reduce no error.
 """
 
 import math
@@ -20,6 +23,9 @@ from ..posterior import Posterior
 FEWEST, MOST = 1000, 16_000  # evaluations with a target
 MOST_WITHOUT_TARGET = 10_000
 DOMINANT = 1.5  # ratio of errors at which the evaluations are to blame
+# The effective number of terms below which they have no error to speak of, and its growth by twice
+# as many, at least.
+FEW, GROWTH = 10.0, 1.25
 RATIO = 0.5  # of the evaluations' error to that of the draws, below which more hardly help
 
 
@@ -52,6 +58,11 @@ def is_small(
         return True
     se = math.hypot(se_draws, se_evaluations)
     return se <= target_se or se_evaluations <= ratio * se_draws
+
+
+def stands_still(former: float, n_effective: float) -> bool:
+    """Whether terms are worth few, and hardly more than the ``former`` half of them alone."""
+    return n_effective < min(FEW, GROWTH * former)
 
 
 def ratio_of_errors(target_se: float, se_draws: float) -> float:

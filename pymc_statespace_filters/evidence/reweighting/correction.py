@@ -23,6 +23,9 @@ MOST_SEEDS = 16
 # Relative variance that the noise of the averaged estimates of a point may have; it is one where
 # half of the effective draws are lost.
 MAX_NOISE = 1.0
+# Estimates at the draws that are weighted unless their number is given; at those that only say
+# where an evidence is; and the fewest of these draws.
+MOST_ESTIMATES, MOST_GUIDING, FEWEST_GUIDING = 32_000, 4000, 500
 MOST_DRAWS = 1000  # that are weighted for an evidence
 BEYOND = 0.01  # share of the corrected draws that lie further out than all others
 
@@ -101,7 +104,7 @@ def correct(
     posterior: Posterior,
     kept: Posterior,
     evaluate: Evaluate,
-    n_noisy: int,
+    seeds_of_point: tuple[int, int],
     rng: np.random.Generator,
     announce: Callable[[str, int], None] = lambda task, total: None,
 ) -> Correction:
@@ -115,13 +118,14 @@ def correct(
         The same with those draws that are weighted.
     evaluate : callable
         ``evaluate(x, seeds)`` estimates the exact log-density at points x (m, k), r times each:
-        from seeds (m, r, n_noisy) to estimates (m, r).
-    n_noisy : int
-        Number of noisy likelihoods in it.
+        from seeds (m, r, v) to estimates (m, r).
+    seeds_of_point : (int, int)
+        r, as by `seeds_needed`, and v, the number of noisy likelihoods.
     rng : numpy.random.Generator
     announce : callable, optional
         Told what is evaluated next, and the number of estimates.
     """
+    n_seeds, n_noisy = seeds_of_point
     fit = choose_mixture(posterior, rng)
     draws = kept.draws.reshape(-1, kept.draws.shape[-1])
     level = float(np.quantile(fit.log_density(draws), BEYOND))
@@ -133,7 +137,6 @@ def correct(
     q = defensive_mixture(posterior, fit, level, once, rng)
     points = q.sample(max(FEWEST_POINTS, int(POINTS_PER_DRAW * len(draws))), rng)
     x = np.concatenate([draws, points])
-    n_seeds = _seeds_needed(draws, evaluate, n_noisy, rng) if n_noisy else 1
     seeds = fresh_seeds((len(x), n_seeds, n_noisy), rng)
     announce("weights", n_seeds * len(x))
     log_estimates = evaluate(x, seeds)
@@ -158,8 +161,10 @@ def exact_posterior(
     They are those of the approximate posterior, at most `MOST_DRAWS`, corrected; or as they are, if
     too few effective ones would be left.
     """
-    kept = posterior.thinned(MOST_DRAWS)
-    found = correct(posterior, kept, density.evaluate, density.n_noisy, rng, announce)
+    n_seeds = seeds_needed(posterior, density.evaluate, density.n_noisy, rng)
+    kept = posterior.thinned(min(MOST_DRAWS, max(FEWEST_GUIDING, MOST_GUIDING // n_seeds)))
+    seeds_of_point = n_seeds, density.n_noisy
+    found = correct(posterior, kept, density.evaluate, seeds_of_point, rng, announce)
     if found.pooled.effective_size(found.x) >= MIN_EFFECTIVE:
         index, chosen = found.resampled(rng)
     else:
@@ -178,16 +183,21 @@ def exact_posterior(
     )
 
 
-def _seeds_needed(draws: Array, evaluate: Evaluate, n_noisy: int, rng: np.random.Generator) -> int:
+def seeds_needed(
+    posterior: Posterior, evaluate: Evaluate, n_noisy: int, rng: np.random.Generator
+) -> int:
     """How many estimates of a point are averaged, so that their noise decides no weight.
 
     If the log of an estimate has the variance v, the mean of r of them has the relative variance
-    (exp(v) - 1) / r.
+    (exp(v) - 1) / r. That of most draws decides: at few that are far noisier no mean is good.
     """
+    if not n_noisy:
+        return 1
+    draws = posterior.draws.reshape(-1, posterior.draws.shape[-1])
     measured = draws[np.linspace(0, len(draws) - 1, N_MEASURED).astype(int)]
     found = evaluate(measured, fresh_seeds((N_MEASURED, N_MEASURING, n_noisy), rng))
     finite = found[np.isfinite(found).all(axis=1)]
-    variance = float(finite.var(axis=1, ddof=1).mean()) if len(finite) else np.inf
+    variance = float(np.median(finite.var(axis=1, ddof=1))) if len(finite) else np.inf
     most = np.log1p(MAX_NOISE * MOST_SEEDS)
     return max(1, int(np.ceil(np.expm1(min(variance, most)) / MAX_NOISE)))
 

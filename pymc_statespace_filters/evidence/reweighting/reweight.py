@@ -1,6 +1,7 @@
 """The public function: draws of an approximate posterior, corrected by an unbiased filter."""
 
 import json
+import time
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -10,11 +11,13 @@ import pymc as pm
 import xarray as xr
 
 from ...compiler.native.compilation import COMPILATION
-from ...errors import INSIDE, EvidenceWarning, ModelError
+from ...errors import INSIDE, EvidenceWarning, FilterWarning, ModelError
+from ...filter_checks.checks import MORE_POINTS, check_at_end, doubts, store
 from ...filters.protocol import Filter
 from ...filters.recommendation import short_form
 from ...importance import MIN_EFFECTIVE, largest_good_k, pareto_k
 from ...parallel.cpu_affinity import cores_set_to
+from ...parallel.shared_rows import by_first_rank
 from ...progress import row_progress
 from ...pymc_model.density import ModelDensity
 from ...pymc_model.in_step import shared_by_ranks
@@ -23,7 +26,7 @@ from ...pymc_model.posterior_draws import MIN_DRAWS, noise_was_moved, posterior_
 from ...system.checks import check_count, check_random_seed, is_integer
 from ..exact_density import ExactDensity
 from ..posterior_of_draws import build_posterior
-from .correction import Correction, correct
+from .correction import MOST_ESTIMATES, Correction, correct, seeds_needed
 from .result import reweighted_tree
 
 # Nats, and the share of the draws below which their spread costs too much: it does not where the
@@ -64,7 +67,7 @@ def reweight(
         Unbiased, as `BootstrapPF` and `GuidedPF`, or exact for the system, as `GridFilter`.
     n_draws : int, optional
         Number of draws that are weighted, evenly from every chain, and of draws returned; by
-        default all.
+        default all, or as many as 32 000 estimates allow.
     random_seed : int or numpy.random.Generator, optional
         Of the noise of the filter, of further points and of the resampling.
     progressbar : bool
@@ -102,7 +105,7 @@ def reweight(
           posterior where there are no draws;
         * ``log_evidence`` of the exact model, and ``log_evidence_change``, the same minus that of
           the model with its own filter; standard errors with the suffix ``_se``;
-        * ``filter`` and ``exact``, as of `sample_dram`.
+        * ``filter``, ``exact`` and ``filter_check``, as of `sample_dram`.
 
     Raises
     ------
@@ -117,6 +120,10 @@ def reweight(
 
     Warns
     -----
+    FilterWarning
+        If the new filter is found to be off at the result, by the check that `sample_dram` makes at
+        its end (`check_filter`): weights do not show that a `GuidedPF` is too low. ``exact`` is
+        then 0.
     EvidenceWarning
         If the log-weights spread by more than 2 nats and are worth less than a fifth of the draws,
         if few weights decide (Pareto k or effective size), or if more than a twentieth of the exact
@@ -129,8 +136,9 @@ def reweight(
     therefore look for what is missing. Draws and points are one sample, with weights relative to
     the mixture of their densities, and the result contains both.
 
-    The filter is evaluated once at each draw, or up to 16 times if the noise of one estimate would
-    decide the weights, and about 900 times more.
+    The filter is evaluated once at each draw and further point, or up to 16 times if the noise of
+    one estimate would decide the weights, and about 600 times more. The check of the filter takes
+    four CPU seconds at most, or a tenth of the time of the rest.
 
     References
     ----------
@@ -165,35 +173,44 @@ def reweight(
     (True, True)
     """
     model = model_of_draws(model, idata)
-    rng = check_random_seed(random_seed)
+    rng, began = check_random_seed(random_seed), time.process_time()
     with cores_set_to(None if cores is None else check_count("cores", cores, 1)), COMPILATION:
-        rows = _rows(idata, n_draws)
         exact = ExactDensity(model, filter)
         density = ModelDensity(model, moved=noise_was_moved(idata))
         posterior, _ = build_posterior(idata, density)
-        kept = posterior.at(np.s_[:, rows])
+        n_seeds = seeds_needed(posterior, exact.evaluate, exact.n_noisy, rng)
+        rows = _rows(idata, n_draws, MOST_ESTIMATES // n_seeds)
+        kept, seeds_of_point = posterior.at(np.s_[:, rows]), (n_seeds, exact.n_noisy)
         with row_progress(exact, enabled=progressbar) as announce:
-            found = correct(posterior, kept, exact.evaluate, exact.n_noisy, rng, announce)
+            found = correct(posterior, kept, exact.evaluate, seeds_of_point, rng, announce)
         draws = posterior_group(idata).isel(draw=rows)
         tree = reweighted_tree(idata, draws, found, exact, rng)
+        own = np.random.default_rng(rng.integers(2**63))
+        seconds = time.process_time() - began
+        given = tree, model, filter, seconds, own, MORE_POINTS
+        outcomes = by_first_rank(lambda: check_at_end(*given))
     attrs = _attributes(found, exact)
     tree.attrs |= attrs
+    store(tree, outcomes)
+    if off := doubts(outcomes):  # by which the weights are as they are
+        warnings.warn("; ".join(off), FilterWarning, skip_file_prefixes=INSIDE)
+        return tree
     for problem in _problems(attrs, filter):
         warnings.warn(problem, EvidenceWarning, skip_file_prefixes=INSIDE)
     return tree
 
 
-def _rows(idata: xr.DataTree, n_draws: int | None) -> np.ndarray:
+def _rows(idata: xr.DataTree, n_draws: int | None, default: int) -> np.ndarray:
     """The draws of every chain that are weighted."""
     posterior = posterior_group(idata)
     n_chains, length = posterior.sizes["chain"], posterior.sizes["draw"]
     least, most = n_chains * MIN_DRAWS, n_chains * length
     if n_draws is None:
-        return np.arange(length)
+        n_draws = min(most, max(least, default))
     if not is_integer(n_draws) or not least <= n_draws <= most:
         raise ModelError(
-            f"n_draws must be an integer from {least} to {most}, the number of draws, or None for "
-            f"all of them, got {n_draws!r}"
+            f"n_draws must be an integer from {least} to {most}, the number of draws, or None, got "
+            f"{n_draws!r}"
         )
     return np.linspace(0, length - 1, n_draws // n_chains).round().astype(int)
 

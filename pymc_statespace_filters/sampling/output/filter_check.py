@@ -11,15 +11,12 @@ from pymc.stats.convergence import SamplerWarning, WarningType
 from xarray import DataTree
 
 from ...errors import FilterWarning, StateSpaceFiltersError
-from ...filter_checks.checks import check_model, outcomes_of, store
+from ...filter_checks.checks import check_at_end, doubts, store
 from ...filter_checks.finding import EXACT, OFF
 from ...filters.protocol import Filter
 from ...pymc_model.inspection import observes_state_space
 from ...pymc_model.posterior_draws import MIN_DRAWS
 
-N_POINTS = 20
-# CPU seconds: so many, or this share of the time of the run if that is more.
-LEAST_SECONDS, _SHARE = 2.0, 0.1
 # Runs of fewer iterations are trials.
 _LEAST_ITERATIONS = 600
 
@@ -60,24 +57,13 @@ def check_filters(
     if not observes_state_space(model) or n_draws < MIN_DRAWS or n_iterations < _LEAST_ITERATIONS:
         return FilterCheck()
     try:
-        table = check_model(
-            tree,
-            model,
-            filter=filter,
-            n_points=N_POINTS,
-            seconds=max(LEAST_SECONDS, _SHARE * seconds),
-            rng=rng,
-        )
+        outcomes = check_at_end(tree, model, filter, seconds, rng)
     except StateSpaceFiltersError as error:
         return FilterCheck((f"The filter was not checked: {error}",))
-    outcomes = outcomes_of(table)
     store(tree, outcomes)
-    compared = [
-        (one["outcome"] == OFF, f"{name}: {one['verdict']}")
+    said = [
+        f"{name}: {one['verdict']}"
         for name, one in outcomes.items()
-        if one["outcome"] != EXACT  # nothing was compared
+        if one["outcome"] not in (OFF, EXACT)  # of an exact one nothing was compared
     ]
-    return FilterCheck(
-        tuple(text for is_off, text in compared if not is_off),
-        tuple(text for is_off, text in compared if is_off),
-    )
+    return FilterCheck(tuple(said), tuple(doubts(outcomes)))

@@ -21,7 +21,6 @@ from ...pymc_model.inspection import (
 )
 from ...pymc_model.panel_structure import panel_structure
 from ..kernel.state import draw_seeds
-from ..output.filter_check import LEAST_SECONDS, N_POINTS
 from ..output.likelihood_variance import TOO_NOISY, SeedSpread, spread_of
 from ..target.target import Target
 from ..target.variables import RaveledVariables, continuous_value_vars
@@ -124,10 +123,7 @@ class NoisyLikelihood:
             return None
         filter = resized(self.filter, n_particles)
         self._effort.announce("Check of the filter", 1)
-        return doubt_at(
-            self._model, self.name, filter, self._draws, n_points=N_POINTS, seconds=LEAST_SECONDS,
-            rng=self._rng,
-        )  # fmt: skip
+        return doubt_at(self._model, self.name, filter, self._draws, self._rng)
 
     def _compiled(self, filter: Filter) -> RowFunction:
         logp = self._model.logp()
