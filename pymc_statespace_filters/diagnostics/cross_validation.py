@@ -15,8 +15,8 @@ from scipy.special import logsumexp
 
 from ..errors import INSIDE, EvidenceWarning, ModelError
 from ..importance import largest_good_k, smoothed
+from ..pymc_model.checked_model import checked_model
 from ..pymc_model.in_step import shared_by_ranks
-from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.state_space_variable import StateSpaceVariable
 from ..states.draws import select_draws
 from ..states.variable import select_variables
@@ -134,7 +134,7 @@ def leave_future_out(
     >>> score.elpd_i.sizes["d_time"], bool(score.pareto_k.max() < 0.7)
     (20, True)
     """
-    model = model_of_draws(model, idata)
+    model = checked_model(model, idata)
     if refit is not None and comm is not None:
         raise ModelError("comm must be None with refit, whose sampler takes it")
     variable = _one_variable(model, var_name)

@@ -12,7 +12,7 @@ from ..filter_checks.checks import stored
 from ..filter_checks.finding import OFF
 from ..filters.outcomes import COLLAPSED
 from ..filters.protocol import HealthFilter
-from ..pymc_model.other_filter import model_of_draws
+from ..pymc_model.checked_model import checked_model
 from ..pymc_model.state_space_variable import StateSpaceVariable
 from ..states.draws import select_draws
 from ..states.groups import add_group, by_record, coords_of_steps, join_rows
@@ -47,6 +47,7 @@ def filter_diagnostics(
     *,
     var_name: str | None = None,
     filter: Any = None,
+    new_data: bool = False,
     n_draws: int | None = None,
     random_seed: int | np.random.Generator | None = None,
     extend_inferencedata: bool = True,
@@ -66,7 +67,7 @@ def filter_diagnostics(
 
     Parameters
     ----------
-    idata, model, var_name, filter, extend_inferencedata, progressbar
+    idata, model, var_name, filter, new_data, extend_inferencedata, progressbar
         As in `filtered_states`.
     n_draws : int, optional
         Number of draws to use, evenly from every chain. By default all of them, or of long records
@@ -121,6 +122,8 @@ def filter_diagnostics(
     ModelError
         If draws, model and settings are inconsistent, or the system defines the density of
         observations but no distribution to simulate them from.
+    DataMismatchError
+        If the draws are those of another model or, unless ``new_data``, of other data.
 
     Warns
     -----
@@ -157,7 +160,7 @@ def filter_diagnostics(
     >>> dict(found["d_pit"].sizes), bool(found["d_uniformity"].item() > 0.01)
     ({'d_time': 40, 'observable': 1}, True)
     """
-    model = model_of_draws(model, idata)
+    model = checked_model(model, idata, any_filter=filter is not None, new_data=new_data)
     rng = check_random_seed(random_seed)
     variables = select_variables(model, var_name, filter)
     every = select_draws(idata, None)

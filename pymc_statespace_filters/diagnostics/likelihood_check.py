@@ -9,7 +9,7 @@ import xarray as xr
 
 from ..filter_checks.checks import check_model, outcomes_of, store
 from ..filters.protocol import check_filter as check_is_filter
-from ..pymc_model.other_filter import model_of_draws
+from ..pymc_model.checked_model import checked_model
 from ..system.checks import check_count, check_flag, check_random_seed
 from ..tables import SentenceTable
 
@@ -103,7 +103,7 @@ def check_filter(
         If the model has no observed StateSpace variable or a discrete free variable, the filter
         cannot treat its system, or an argument is not as described.
     DataMismatchError
-        If idata lacks draws of a free variable.
+        If idata lacks draws of a free variable, or they are those of another model or other data.
 
     Notes
     -----
@@ -156,7 +156,7 @@ def check_filter(
     >>> "GridFilter" in table["verdict"][0]
     True
     """
-    model = model_of_draws(model, idata)
+    model = checked_model(model, idata, any_filter=filter is not None)
     if filter is not None:
         check_is_filter(filter)
     table = check_model(

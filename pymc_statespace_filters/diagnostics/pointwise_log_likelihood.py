@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ..errors import ModelError
 from ..filters.protocol import properties
+from ..pymc_model.checked_model import checked_model
 from ..pymc_model.in_step import shared_by_ranks
-from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.sequential_terms import warn_of_sequence
 from ..pymc_model.state_space_variable import StateSpaceVariable, terms_of
 from ..states.draws import PosteriorDraws, select_draws
@@ -37,6 +37,7 @@ def compute_log_likelihood(
     model: pm.Model | None = None,
     *,
     var_name: str | None = None,
+    new_data: bool = False,
     extend_inferencedata: bool = True,
     progressbar: bool = True,
     comm: Any = None,
@@ -65,7 +66,7 @@ def compute_log_likelihood(
     ----------
     idata : xarray.DataTree
         Posterior draws. If ``sample_stats`` holds no seeds, the seed of the model is used.
-    model, var_name, progressbar, comm
+    model, var_name, new_data, progressbar, comm
         As in `filtered_states`.
     extend_inferencedata : bool
         Whether to add the terms to the group of `idata`, beside those of other variables; otherwise
@@ -84,6 +85,8 @@ def compute_log_likelihood(
     ModelError
         If draws and model are inconsistent, or the chain moved its noise (``correlation``), so that
         no seed reproduces the estimates.
+    DataMismatchError
+        If the draws are those of another model or, unless ``new_data``, of other data.
 
     Warns
     -----
@@ -113,7 +116,7 @@ def compute_log_likelihood(
     >>> dict(terms.sizes)
     {'chain': 2, 'draw': 100, 'd_record': 2}
     """
-    model = model_of_draws(model, idata)
+    model = checked_model(model, idata, new_data=new_data)
     draws, variables = select_draws(idata, None), select_variables(model, var_name)
     if names := [repr(one.name) for one in variables if not one.is_panel]:
         warn_of_sequence(", ".join(names))

@@ -18,6 +18,7 @@ from ..compiler.native.rows import at_points
 from ..errors import DataMismatchError, ModelError
 
 MIN_DRAWS = 20
+STATES = "sampler_state"  # the group of the last states of chains
 # Values of the attribute ``sampler`` of draws.
 BY_PARTICLES = "smc"  # their filter may not be that of the model
 AVERAGED = "select_terms"  # over sub-models
@@ -95,8 +96,8 @@ def check_same_rows(idata: xr.DataTree, model: pm.Model) -> None:
     for rv in model.observed_RVs:
         if rv.name not in record:
             continue
-        own = _not_missing(model.rvs_to_values[rv].eval(mode="FAST_COMPILE"))
-        seen = _not_missing(record[rv.name].values)
+        own = not_missing(model.rvs_to_values[rv].eval(mode="FAST_COMPILE"))
+        seen = not_missing(record[rv.name].values)
         if np.array_equal(seen, own, equal_nan=True):
             continue
         remedy = "go on with the others by psf.extend"
@@ -109,7 +110,7 @@ def check_same_rows(idata: xr.DataTree, model: pm.Model) -> None:
         )
 
 
-def _not_missing(rows: ArrayLike) -> NDArray[np.float64]:
+def not_missing(rows: ArrayLike) -> NDArray[np.float64]:
     """The rows (J, p) of a record that are not entirely missing."""
     values = np.asarray(rows, dtype=np.float64)
     return values[~np.isnan(values).all(axis=-1)]
@@ -121,11 +122,16 @@ def noise_was_moved(idata: xr.DataTree) -> bool:
 
 
 def unconstrained_draws(
-    idata: xr.DataTree, model: pm.Model, names: Sequence[str] | None = None
+    idata: xr.DataTree,
+    model: pm.Model,
+    names: Sequence[str] | None = None,
+    *,
+    least: int = MIN_DRAWS,
 ) -> NDArray[np.float64]:
     """The posterior group, checked against the model, in unconstrained space (chain, draw, k).
 
-    Of the free variables with these names; default: all. The others may be missing.
+    Of the free variables with these names; default: all. The others may be missing. Of each chain
+    there must be at least so many draws.
     """
     posterior = posterior_group(idata)
     chosen = [rv for rv in model.free_RVs if names is None or rv.name in names]
@@ -136,8 +142,8 @@ def unconstrained_draws(
             f"{sorted(map(str, posterior.data_vars))}"
         )
     n_chains, n_draws = posterior.sizes["chain"], posterior.sizes["draw"]
-    if n_draws < MIN_DRAWS:
-        raise ModelError(f"idata must have at least {MIN_DRAWS} draws per chain, got {n_draws}")
+    if n_draws < least:
+        raise ModelError(f"idata must have at least {least} draws per chain, got {n_draws}")
 
     shapes = model.eval_rv_shapes()
     for rv in chosen:

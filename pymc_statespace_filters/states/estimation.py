@@ -7,9 +7,9 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
+from ..pymc_model.checked_model import checked_model
 from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.observation_moments import sensors_of_states
-from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.state_space_variable import observed_variables, smoothing_method
 from ..system.checks import check_random_seed
 from ..system.own_units import in_own_units, moments_in_own_units
@@ -27,6 +27,7 @@ def filtered_states(
     var_name: str | None = None,
     filter: Any = None,
     at: str = "observations",
+    new_data: bool = False,
     n_draws: int | None = None,
     random_seed: int | np.random.Generator | None = None,
     extend_inferencedata: bool = True,
@@ -48,6 +49,8 @@ def filtered_states(
     at : {"observations", "steps"}
         Times of the states: those of the observations, or every step from 0 to the last
         observation.
+    new_data : bool
+        Whether the data of the model are other ones than those of the draws, on purpose.
     n_draws : int, optional
         Number of draws, spread evenly over every chain; all by default.
     random_seed : None, int or numpy.random.Generator
@@ -79,6 +82,8 @@ def filtered_states(
     ------
     ModelError
         If draws, model and settings are inconsistent.
+    DataMismatchError
+        If the draws are those of another model or, unless ``new_data``, of other data.
 
     Warns
     -----
@@ -111,7 +116,7 @@ def filtered_states(
     Frozen({'chain': 2, 'draw': 200, 'd_time': 5, 'state': 1})
     """
     return _add_states(
-        "filtered", idata, model, var_name, filter, at, n_draws, random_seed,
+        "filtered", idata, model, var_name, filter, at, new_data, n_draws, random_seed,
         extend_inferencedata, progressbar,
     )  # fmt: skip
 
@@ -124,6 +129,7 @@ def smoothed_states(
     var_name: str | None = None,
     filter: Any = None,
     at: str = "observations",
+    new_data: bool = False,
     n_draws: int | None = None,
     random_seed: int | np.random.Generator | None = None,
     extend_inferencedata: bool = True,
@@ -166,7 +172,7 @@ def smoothed_states(
     Frozen({'chain': 2, 'draw': 200, 'd_time': 3, 'state': 1})
     """
     return _add_states(
-        "smoothed", idata, model, var_name, filter, at, n_draws, random_seed,
+        "smoothed", idata, model, var_name, filter, at, new_data, n_draws, random_seed,
         extend_inferencedata, progressbar,
     )  # fmt: skip
 
@@ -178,12 +184,13 @@ def _add_states(
     var_name: str | None,
     filter: Any,
     at: str,
+    new_data: bool,
     n_draws: int | None,
     random_seed: Any,
     extend_inferencedata: bool,
     progressbar: bool,
 ) -> xr.DataTree:
-    model = model_of_draws(model, idata)
+    model = checked_model(model, idata, any_filter=filter is not None, new_data=new_data)
     check_at(at)
     rng = check_random_seed(random_seed)
     draws = select_draws(idata, n_draws)

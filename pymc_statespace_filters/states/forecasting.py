@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from ..compiler.native.python_call import call_machine_code
 from ..errors import ModelError
 from ..evaluation.simulate import continuation
+from ..pymc_model.checked_model import checked_model
 from ..pymc_model.in_step import shared_by_ranks
-from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.state_space_variable import observed_variables
 from ..system.checks import check_floats, check_random_seed, is_integer
 from ..system.given_record import inputs_with_times, own_inputs
@@ -44,6 +44,7 @@ def forecast(
     inputs_at: str = "hold",
     var_name: str | None = None,
     filter: Any = None,
+    new_data: bool = False,
     n_draws: int | None = None,
     random_seed: int | np.random.Generator | None = None,
     extend_inferencedata: bool = True,
@@ -58,7 +59,9 @@ def forecast(
 
     Parameters
     ----------
-    idata, model, var_name, filter, n_draws, random_seed, extend_inferencedata, progressbar, comm
+    idata, model, var_name, filter, new_data, n_draws, random_seed
+        As in `filtered_states`.
+    extend_inferencedata, progressbar, comm
         As in `filtered_states`.
     n_steps : int, optional
         Number of steps after the last observation. Give exactly one of `n_steps`, `steps`, `times`.
@@ -89,6 +92,8 @@ def forecast(
     ------
     ModelError
         If draws, model and settings are inconsistent.
+    DataMismatchError
+        If the draws are those of another model or, unless ``new_data``, of other data.
 
     Warns
     -----
@@ -115,7 +120,7 @@ def forecast(
     >>> idata["predictions"]["d"].sizes, idata["predictions"]["d_time"].values
     (Frozen({'chain': 2, 'draw': 200, 'd_time': 3, 'observable': 1}), array([5., 6., 7.]))
     """
-    model = model_of_draws(model, idata)
+    model = checked_model(model, idata, any_filter=filter is not None, new_data=new_data)
     rng = check_random_seed(random_seed)
     draws = select_draws(idata, n_draws)
     dims = state_dims(observed_variables(model))

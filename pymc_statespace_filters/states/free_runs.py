@@ -16,7 +16,7 @@ from ..errors import INSIDE, FilterWarning, ModelError
 from ..evaluation.simulate import simulator
 from ..parallel.cpu_affinity import available_cores
 from ..parallel.threads import run_in_threads
-from ..pymc_model.inspection import given_model
+from ..pymc_model.checked_model import checked_model
 from ..pymc_model.state_space_variable import observed_variables
 from ..system.checks import check_flag, check_random_seed, shortened
 from ..system.given_record import inputs_with_times
@@ -44,6 +44,7 @@ def free_run(
     observed: Any = None,
     noise: bool = False,
     var_name: str | None = None,
+    new_data: bool = False,
     n_draws: int | None = None,
     random_seed: int | np.random.Generator | None = None,
     extend_inferencedata: bool = True,
@@ -56,7 +57,7 @@ def free_run(
 
     Parameters
     ----------
-    idata, model, var_name, n_draws, random_seed, extend_inferencedata, progressbar
+    idata, model, var_name, new_data, n_draws, random_seed, extend_inferencedata, progressbar
         As in `filtered_states`.
     inputs : array_like, shape (rows, n_inputs), optional
         Row k holds during step k; by default those of the model. Of a panel also an array for
@@ -100,6 +101,8 @@ def free_run(
     ------
     ModelError
         If draws, model and settings are inconsistent.
+    DataMismatchError
+        If the draws are those of another model or, unless ``new_data``, of other data.
 
     Warns
     -----
@@ -137,7 +140,7 @@ def free_run(
     (Frozen({'chain': 2, 'draw': 200, 'd_time': 2, 'observable': 1}),
      Frozen({'interval': 2, 'observable': 1}))
     """
-    model = given_model(model)
+    model = checked_model(model, idata, any_filter=True, new_data=new_data)
     with_noise = check_flag("noise", noise)
     rng = check_random_seed(random_seed)
     draws = select_draws(idata, n_draws)

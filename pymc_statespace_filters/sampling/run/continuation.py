@@ -15,12 +15,11 @@ from xarray import DataTree
 
 from ...errors import DataMismatchError, ModelError
 from ...pymc_model.fingerprint import model_data_fingerprint, model_fingerprint
-from ...pymc_model.posterior_draws import posterior_group, unconstrained_draws
+from ...pymc_model.posterior_draws import STATES, posterior_group, unconstrained_draws
 from ..kernel.state import ChainState
 from ..output.sample_stats import running_means
 from ..target.settings import RandomWalkSettings
 
-GROUP = "sampler_state"
 _APPENDED = ("posterior", "sample_stats")
 # Unsigned words, which not every file format has.
 _WORDS = "key"
@@ -97,13 +96,13 @@ def former_chains(
             "continue_from must be draws of sampler='dram', got those of NUTS, which cannot go on: "
             "draw again with more draws, or with sampler='dram'"
         )
-    if GROUP not in idata.children:
+    if STATES not in idata.children:
         raise ModelError(
-            f"continue_from must have the group {GROUP!r}, which complete runs of sample and "
+            f"continue_from must have the group {STATES!r}, which complete runs of sample and "
             "sample_dram have without correlated noise; draw again, with these draws as pilot of "
             "sample_dram"
         )
-    group = idata[GROUP].dataset
+    group = idata[STATES].dataset
     _check(group, model, settings, chains)
     arrays = {name: np.ascontiguousarray(group[name].values) for name in group.data_vars}
     arrays[_WORDS] = arrays[_WORDS].view(np.uint64)

@@ -12,6 +12,7 @@ from xarray import DataTree
 from ...parallel.signals import is_interrupted, unless_interrupted
 from ...pymc_model.elements import element_names
 from ...pymc_model.inspection import filters_used
+from ...pymc_model.posterior_draws import STATES
 from ..kernel.state import ChainState, Draws, side_generator
 from ..output.convergence import Convergence
 from ..output.datatree import to_datatree
@@ -33,7 +34,7 @@ from ..output.unvisited import unvisited_warnings
 from ..output.warnings import LOWER, STANDSTILL, PhaseStatistics, below_known, chain_warnings
 from ..target.record_target import RecordTarget
 from ..target.target import Target
-from .continuation import GROUP, stored_states
+from .continuation import stored_states
 from .record_chain import chain_of
 from .request import SamplingRequest
 from .stopping import ENOUGH, Length, is_enough, remedy_of, shows
@@ -111,7 +112,7 @@ class ModelResult:
             **attrs,
         }
         if states is not None:
-            tree[GROUP] = states
+            tree[STATES] = states
         check = FilterCheck()
         if check_convergence and "posterior" in tree:
             noise_warnings += unless_interrupted(lambda: self._unvisited_warnings(tree, key), [])
