@@ -14,8 +14,8 @@ from scipy.special import logsumexp
 from ..errors import EvidenceWarning
 from ..importance import MAX_PARETO_K, MIN_EFFECTIVE, mcse, pareto_k
 from ..progress import row_progress
+from ..pymc_model.checked_model import checked_model
 from ..pymc_model.density import RowFunction, check_free_variables
-from ..pymc_model.inspection import given_model
 from ..pymc_model.posterior_draws import MIN_DRAWS, populations_of, unconstrained_draws
 from ..pymc_model.step_refinement import densities_by_halvings, step_lengths
 from ..system.checks import check_count, check_random_seed
@@ -124,7 +124,7 @@ def step_error(
     >>> bool(abs(table["log_evidence_change"].item()) < 0.05)
     True
     """
-    model = given_model(model)
+    model = checked_model(model, idata, any_filter=True)
     check_free_variables(model)
     check_count("halvings", halvings, 1)
     check_count("n_draws", n_draws, MIN_DRAWS)

@@ -137,5 +137,6 @@ def _check_density(idata: xr.DataTree, model: pm.Model, remedy: str) -> None:
     with COMPILATION:
         density = ModelDensity(model)
     if not lacking_seeds(stats, density) and not has_seeds_of_records(stats, density):
-        seeds = stored_seeds(stats, density, draws.shape[:2])
+        with np.errstate(invalid="ignore"):  # what is no seed is refused where it is used
+            seeds = stored_seeds(stats, density, draws.shape[:2])
         compared(stats, name, density, draws, seeds, f": {remedy}")

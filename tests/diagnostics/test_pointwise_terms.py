@@ -93,7 +93,7 @@ def test_rows_set_after_sampling_must_reach_the_scored_ones(idata):
         new = {"at": [0, 2], "y": np.zeros((2, 1))}
         pm.set_data(new, coords={"d_time": [0, 2]})
     with pytest.raises(ModelError, match=r"score_from of 'd' must be less .* got 2 of 2"):
-        psf.compute_log_likelihood(idata, model)
+        psf.compute_log_likelihood(idata, model, new_data=True)
 
 
 def test_they_say_that_they_are_sequential(terms, tmp_path):

@@ -83,7 +83,7 @@ def test_another_filter_or_other_data_may_fail(model, seeds):
     psf.filtered_states(idata_of(bad, filter='{"d": "BootstrapPF(1000)"}'), model)
     other = idata_of(bad)
     other["observed_data"]["d"] = other["observed_data"]["d"] + 1.0
-    psf.filtered_states(other, model)
+    psf.filtered_states(other, model, new_data=True)
 
 
 @pytest.mark.parametrize("value", [np.nan, 0.5, -1.0])
