@@ -44,7 +44,7 @@ N_TAILS = 2  # that are looked at
 FALSE_ALARMS = 0.02  # probability of a finding in any tail, if there is none
 DEGREES_OF_FREEDOM = 30  # of the errors, of some hundred effective draws and points
 MIN_MISSED, MIN_EFFECTIVE = 0.02, 50.0
-MOST_DRAWS, MIN_DRAWS = 20_000, 50  # that are compared; different ones in a tail, at least
+MIN_DRAWS = 50  # different ones in a tail, at least
 N_EVALUATIONS = N_BRIDGE + N_TAILS * sum(SIZES)
 LEAST_SHARE = 0.2  # of these, with which the errors are not too large for a finding
 
@@ -97,9 +97,7 @@ def missed_tails(
         How many points may be evaluated. With too few, nothing is found.
     rng : numpy.random.Generator
     """
-    n_chains, n, k = draws.shape
-    step = max(1, -(-n_chains * n // MOST_DRAWS))
-    draws, log_density = draws[:, ::step], log_density[:, ::step]
+    k = draws.shape[-1]
     part = min(1.0, n_evaluations / N_EVALUATIONS)
     centre, scale = draws.mean(axis=(0, 1)), draws.std(axis=(0, 1))
     if k > MOST_PARAMETERS or part < LEAST_SHARE or not (scale > 0).all():

@@ -22,6 +22,7 @@ from .tail_proposals import Evaluate
 
 ATTRIBUTE = "unvisited"  # of results, a JSON text
 N_SHOWN = 4  # elements of a point
+MOST_DRAWS = 20_000  # that are looked at
 N_TIMED, N_PARTS = 40, 3  # evaluations whose time is measured; a pause may fall into one part
 
 Array = NDArray[np.float64]
@@ -41,6 +42,8 @@ def unvisited(
     ``seconds`` of CPU time are for all evaluations of either look. Without draws of the ``prior``
     (m, k) there is no look for modes.
     """
+    step = max(1, -(-log_density.size // MOST_DRAWS))
+    draws, log_density = draws[:, ::step], log_density[:, ::step]
     x = draws.reshape(-1, draws.shape[-1])
     timed = x[:: max(1, len(x) // N_TIMED)]
     evaluate(timed[:1], rng)  # the first call may compile
