@@ -81,8 +81,8 @@ class Failure(OutcomeCode):
         13,
         "the covariance of the predicted observation is singular (stochastic singularity)",
         "Give the sensors noise, or let as many independent noises reach the observables as there "
-        "are sensors without noise; if they do, use units in which states and observables have "
-        "similar sizes",
+        "are sensors without noise; if they do, give an initial_cov of at most 1e8 times "
+        "observation_noise, and use units in which states and observables have similar sizes",
     )
 
     @property

@@ -18,7 +18,8 @@ class _Call:
 
     def __init__(self, outer: "_Call | None") -> None:
         self._outer, self._before = outer, signal.getsignal(signal.SIGINT)
-        self._handles = current_thread() is main_thread() and self._before is not None
+        # What is ignored, as in a background job of a shell's script, stays so.
+        self._handles = current_thread() is main_thread() and callable(self._before)
         self.has_result = self.may_skip = self.returns = False
         self.is_interrupted = self.was_interrupted = False  # the first until somebody takes it
 

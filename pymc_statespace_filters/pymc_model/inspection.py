@@ -61,9 +61,13 @@ def observes_state_space(model: pm.Model) -> bool:
 
 
 def check_observed(model: pm.Model) -> None:
-    """Raise unless every StateSpace variable has data: without, its values are drawn as well."""
+    """Raise unless StateSpace variables have data, their own or those of another variable.
+
+    Without, their values are drawn as well.
+    """
+    seen = set(ancestors([*model.observed_RVs, *model.potentials]))
     for name, node in state_space_nodes(model).items():
-        if node.outputs[1] in model.free_RVs:
+        if node.outputs[1] in model.free_RVs and node.outputs[1] not in seen:
             raise ModelError(
                 f"{name!r} has no data, so that its values would be sampled like parameters: give "
                 f"it observed=..., use pm.observe(model, {{{name!r}: data}}), or draw it with "

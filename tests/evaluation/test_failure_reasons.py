@@ -121,6 +121,7 @@ def test_rounding_errors_are_told_from_a_sensor_that_is_not_defined():
     )  # fmt: skip
     observed = np.array([[1.0, 2.0]] * 3)
     check(twice, {"a": 1.0}, Failure.SINGULAR, filters=[psf.EKF()], observed=observed)
+    assert "initial_cov of at most 1e8 times" in Failure.SINGULAR.cure
 
 
 def test_more_exact_sensors_than_shocks_are_a_stochastic_singularity():

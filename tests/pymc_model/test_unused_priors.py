@@ -2,10 +2,12 @@
 
 import numpy as np
 import pymc as pm
+import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError, ModelWarning
+from pymc_statespace_filters.pymc_model.inspection import check_observed
 from pymc_statespace_filters.pymc_model.unused_priors import warn_of_unused_priors
 from pymc_statespace_filters.sampling.target.sampled_model import SampledModel
 from pymc_statespace_filters.sampling.target.settings import RandomWalkSettings
@@ -64,6 +66,9 @@ def test_a_variable_without_data_is_not_sampled():
         psf.sample(model=model)
     with pytest.raises(ModelError, match="'d' has no data"):
         pm.sample(step=psf.DRAM(model=model), model=model)
+    with model:  # seen through another variable
+        pm.Poisson("counts", pt.exp(model["d"][:, 0]), observed=np.ones(len(STEPS), dtype=int))
+    check_observed(model)
 
 
 def test_a_group_of_priors_that_reaches_nothing_is_named():

@@ -68,6 +68,11 @@ def test_from_when_there_is_a_result_interrupts_are_noted():
         press()  # the handler is the former one
 
 
+def test_an_interrupt_that_is_ignored_stays_so():
+    with ignored_interrupts():
+        assert run(press, is_interrupted) == [None, False]
+
+
 def test_an_interrupt_ends_what_can_be_done_without():
     first, second = (lambda: unless_interrupted(lambda: press("found"), "nothing"),) * 2
     third = partial(unless_interrupted, lambda: "found", "nothing")

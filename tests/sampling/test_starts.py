@@ -15,6 +15,7 @@ from pymc_statespace_filters.compiler.native.rows import Rows
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.outcomes import Failure, why_zero
 from pymc_statespace_filters.pymc_model.graph_rewrites import expensive_variables, pilot_filters
+from pymc_statespace_filters.sampling.starts.annealing import Population, anneal
 from pymc_statespace_filters.sampling.starts.population import population_of
 from pymc_statespace_filters.sampling.target.log_density import LogDensity
 from pymc_statespace_filters.sampling.target.target import Target
@@ -196,6 +197,14 @@ def test_a_record_that_is_fitted_exactly_has_no_posterior():
 
 def test_a_parameter_in_small_units_is_no_exact_fit():
     assert all(0.5e-10 < start["r"] < 2e-10 for start in starts_of(_decay(unit=1e-9)))
+    clock = 1e-6 * np.arange(100.0) + np.random.default_rng(0).normal(0, 1e-11, 100)
+    with pm.Model() as in_seconds:
+        r = pm.HalfNormal("r", 1.0)
+        pm.Normal("y", 1e-6 * np.arange(100.0), r, observed=clock)
+    assert all(0.7e-11 < start["r"] < 1.4e-11 for start in starts_of(in_seconds))
+    with pm.Model() as without_data:
+        pm.Potential("p", -1e12 * pm.HalfNormal("r", 1.0))
+    assert all(start["r"] < 2e-11 for start in starts_of(without_data))
 
 
 def test_models_without_a_proper_prior_or_a_positive_likelihood_are_refused():
@@ -212,6 +221,24 @@ def test_models_without_a_proper_prior_or_a_positive_likelihood_are_refused():
         pm.Poisson("n", 3)
     with pytest.raises(ModelError, match="discrete"):
         psf.find_starts(discrete)
+
+
+class _GoesOn(Exception):
+    """The search is past the temperature at which it gives up a posterior that is far away."""
+
+
+def test_a_precise_posterior_of_many_parameters_is_not_taken_for_one_far_away():
+    rng, n_calls = np.random.default_rng(0), 0
+
+    def log_densities(x):
+        nonlocal n_calls
+        if (n_calls := n_calls + 1) > 301:  # three moves at each of a hundred temperatures
+            raise _GoesOn
+        return -0.5 * (x**2).sum(axis=1), -0.5 * ((x / 1e-5) ** 2).sum(axis=1)
+
+    x = rng.normal(size=(200, 40))
+    with pytest.raises(_GoesOn):
+        anneal(Population(x, *log_densities(x)), log_densities, 200, rng)
 
 
 SYSTEM = {

@@ -26,7 +26,9 @@ from ...errors import ModelError
 from ...importance import systematic
 from ...smc.temperature import next_temperature
 
-_PATIENCE, _LEAST_REACHED = 100, 1e-3  # temperatures; the last of them
+# Temperatures; the last of them; its ratio to that of half as many. The ratio is 2 on the way to a
+# posterior far away, and grows by factors in many dimensions: 4 of 1800.
+_PATIENCE, _LEAST_REACHED, _LEAST_GROWTH = 100, 1e-3, 4.0
 _ESS_FRACTION = 0.5  # left by a step of the temperature
 _MOVES = 3  # at each temperature
 N_SWEEPS = 3  # as many moves again and again, at the last temperature
@@ -64,17 +66,19 @@ def anneal(
     ModelError
         If the distributions lie too far apart.
     """
-    temperature, scale = 0.0, 1.0
+    temperature, halfway, scale = 0.0, 0.0, 1.0
     for step in count():
         if temperature == 1.0:
             break
-        if step == _PATIENCE and temperature < _LEAST_REACHED:
+        if step == _PATIENCE // 2:
+            halfway = temperature
+        if step == _PATIENCE and temperature < min(_LEAST_REACHED, _LEAST_GROWTH * halfway):
             raise ModelError(
                 "the prior and the data contradict each other: after "
                 f"{step} steps from the prior towards the posterior the power of the likelihood is "
-                f"{temperature:.1g}, where 1 is the posterior, which must lie thousands of the "
-                "prior's standard deviations away. Compare the units of data and priors, or give "
-                "wider priors"
+                f"{temperature:.1g}, where 1 is the posterior, which must lie a hundred of the "
+                "prior's standard deviations away, or more. Compare the units of data and priors, "
+                "or give wider priors"
             )
         log_ratio = population.log_ratio
         raised = next_temperature(temperature, log_ratio, _ESS_FRACTION)

@@ -12,9 +12,9 @@ from ..target.target import Target
 # On the unconstrained scale, from the lowest draw of the prior down to the points of the search: a
 # factor of 1e6 of a positive variable.
 _MARGIN = 14.0
-# Logarithm of the errors of the model's predictions, relative to the spread of the data, below
-# which a parameter so small is not one in other units.
-_MOST_EXACT = -9.0
+# Logarithm of the errors of the model's predictions, relative to the spread of the data: errors of
+# rounding are below it, those of the best instruments, in units that the prior did not expect, not.
+_MOST_EXACT = -25.0
 
 
 def check_fit(target: Target, found: NDArray[np.float64], log_density: NDArray[np.float64]) -> None:
@@ -42,4 +42,6 @@ def _log_error(model: Model, log_density: float) -> float:
             known = column[np.isfinite(column)]
             n += known.size
             log_spread += known.size * math.log(known.std() or np.abs(known).max() or 1.0)
+    if n == 0:  # no data but Potentials
+        return 0.0
     return -(log_density + log_spread) / n - 0.5 * math.log(2 * math.pi * math.e)
