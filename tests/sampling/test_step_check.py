@@ -5,8 +5,10 @@ import logging
 import numpy as np
 import pymc as pm
 import pytest
+import xarray as xr
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.sampling.output.step_check import step_warnings
 
 
 def decay(dt, integrator=psf.EulerMaruyama, **options):
@@ -42,3 +44,13 @@ def test_steps_too_long_are_named(record, system, is_named, caplog):
         psf.StateSpace("d", system, psf.EKF(), steps=range(1, 101), observed=record["observations"])
         psf.sample(500, sampler="dram", random_seed=1, progressbar=False)
     assert ("steps half as long the posterior would move" in caplog.text) == is_named
+
+
+def test_draws_that_do_not_vary_tell_nothing(record):
+    stuck = xr.Dataset({name: (("chain", "draw"), np.full((2, 100), 1.3)) for name in "ks"})
+    with pm.Model() as model:
+        pm.HalfNormal("k", 4.0)
+        pm.HalfNormal("s", 4.0)
+        observed = record["observations"]
+        psf.StateSpace("d", decay(0.5), psf.EKF(), steps=range(1, 101), observed=observed)
+    assert step_warnings(xr.DataTree.from_dict({"posterior": stuck}), model) == []

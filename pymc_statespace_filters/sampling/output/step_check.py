@@ -21,6 +21,7 @@ _N_POINTS, _N_DRAWS = 10, 200
 # steps whose length times the rate is 0.4.
 _LEAST_DIFFERENCE = 0.04
 _MOST_SHIFT = 1.0  # standard deviations
+_ROUNDING = 1e-12  # of the mean, for the standard deviation of draws that are all the same
 
 Array = NDArray[np.float64]
 
@@ -42,9 +43,10 @@ def step_warnings(tree: DataTree, model: Model) -> list[SamplerWarning]:
     if not (is_known & np.isfinite(fine)).any():
         return []
     weights = softmax((fine - coarse)[is_known])
-    spread = x[is_known].std(axis=0)
-    moved = np.abs(weights @ x[is_known] - x[is_known].mean(axis=0)) / spread
-    shift = float(np.nan_to_num(moved).max())
+    mean, spread = x[is_known].mean(axis=0), x[is_known].std(axis=0)
+    varies = spread > _ROUNDING * np.abs(mean)
+    moved = np.abs(weights @ x[is_known] - mean)[varies] / spread[varies]
+    shift = float(np.nan_to_num(moved).max(initial=0.0))
     if shift < _MOST_SHIFT:
         return []
     return [
