@@ -14,7 +14,7 @@ from ..target.target import Target
 _MARGIN = 14.0
 # Logarithm of the errors of the model's predictions, relative to the spread of the data: errors of
 # rounding are below it, those of the best instruments, in units that the prior did not expect, not.
-_MOST_EXACT = -25.0
+_MOST_EXACT = -20.0
 
 
 def check_fit(target: Target, found: NDArray[np.float64], log_density: NDArray[np.float64]) -> None:
