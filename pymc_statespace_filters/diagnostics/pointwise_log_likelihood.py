@@ -204,6 +204,6 @@ def _increments(record: RecordAtDraws, noise: NDArray[np.int64]) -> Array:
     for j in range(len(record.steps)):
         until = replace(record, steps=record.steps[: j + 1], observed=record.observed[: j + 1])
         totals[:, j] = _terms_at_once(until, noise).sum(axis=1)
+    failed = np.logical_or.accumulate(np.isneginf(totals), axis=1)
     with np.errstate(invalid="ignore"):
-        terms = np.diff(totals, prepend=0.0)
-    return np.where(np.isneginf(totals), -np.inf, terms)
+        return np.where(failed, -np.inf, np.diff(totals, prepend=0.0))

@@ -11,8 +11,9 @@ from pytensor.graph.basic import Constant, Variable
 from ..errors import ModelWarning
 from .held_seed import INSIDE
 
-# An end of the data is this many times the range of all others away from them.
-_FAR = 20.0
+# An end of the data is this many times the range of all others away from them, and, where no number
+# is negative, farther than their range of logarithms: growth and decay have large ratios.
+_FAR, _FAR_IN_LOGS = 20.0, 1.5
 # Different numbers among the others; fewer say little of their range.
 _LEAST_DIFFERENT = 5
 
@@ -41,10 +42,18 @@ def _far_number(column: NDArray[np.float64]) -> float | None:
     distinct = np.unique(column[np.isfinite(column)])
     if len(distinct) <= _LEAST_DIFFERENT:
         return None
-    below, above = distinct[1] - distinct[0], distinct[-1] - distinct[-2]
-    if below > _FAR * (distinct[-1] - distinct[1]):
-        return float(distinct[0])
-    return float(distinct[-1]) if above > _FAR * (distinct[-2] - distinct[0]) else None
+    logs = distinct if distinct[0] < 0 else np.log(distinct + (distinct[0] == 0))
+    for order in (slice(None), slice(None, None, -1)):
+        if _is_far(distinct[order], _FAR) and _is_far(logs[order], _FAR_IN_LOGS):
+            return float(distinct[order][0])
+    return None
+
+
+def _is_far(numbers: NDArray[np.float64], factor: float) -> bool:
+    """Whether the first of ordered numbers is so many times the range of the others away."""
+    with np.errstate(over="ignore"):
+        gap, others = abs(numbers[0] - numbers[1]), abs(numbers[1] - numbers[-1])
+        return bool(gap > factor * others)
 
 
 def _rows(rows: NDArray[np.intp]) -> str:

@@ -51,11 +51,22 @@ def test_a_code_in_data_that_can_be_set_is_named():
         with_codes(TEMPERATURES, [3], 90.0),  # an outlier
         COUNTS,
         np.exp(np.linspace(0.0, 12.0, 40)),  # growth
+        np.exp(-np.array([0.0, 4.0, 4.1, 4.5, 5.0, 6.0, 7.5, 9.0])),  # decay, seen late
         np.append(np.zeros(30), 1e6),  # a step
         RNG.standard_t(3, 400),
         np.full(20, -999.0),
     ],
-    ids=["plain", "missing", "outlier", "counts", "growth", "step", "heavy tails", "constant"],
+    ids=[
+        "plain",
+        "missing",
+        "outlier",
+        "counts",
+        "growth",
+        "decay",
+        "step",
+        "heavy tails",
+        "constant",
+    ],
 )
 def test_honest_numbers_are_not_named(column, recwarn):
     observe(column)

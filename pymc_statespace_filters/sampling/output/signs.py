@@ -19,10 +19,12 @@ Array = NDArray[np.float64]
 def signs_message(model: Model, draws: Array, evaluate: Callable[[Array], Array]) -> str | None:
     """Name an element of draws (n, k) with the same density at the opposite sign, if there is one.
 
-    Only variables that a StateSpace variable depends on: others may well be symmetric.
+    Only variables without a transform that a StateSpace variable depends on: others may well be
+    symmetric.
     """
     parameters = [node.inputs[-5] for node in state_space_nodes(model).values()]
-    used = {rv.name for rv in set(model.free_RVs) & set(ancestors(parameters))}
+    free = [rv for rv, transform in model.rvs_to_transforms.items() if transform is None]
+    used = {rv.name for rv in set(free) & set(ancestors(parameters))}
     elements, negative = Elements.of(model), (draws < 0).mean(axis=0)
     x = draws[np.linspace(0, len(draws) - 1, _N_POINTS).astype(int)]
     for i, share in enumerate(negative):

@@ -11,15 +11,19 @@ from pymc.stats.convergence import SamplerWarning
 from scipy.special import softmax
 from xarray import DataTree
 
+from ...errors import ModelError
 from ...pymc_model.density import RowFunction
+from ...pymc_model.inspection import noisy_filters
 from ...pymc_model.posterior_draws import unconstrained_draws
-from ...pymc_model.step_refinement import densities_by_steps, step_accuracy, step_lengths
+from ...pymc_model.step_refinement import densities_by_halvings, step_accuracy, step_lengths
 from .warnings import sampler_warning
 
 _N_POINTS, _N_DRAWS = 10, 200
 # Of the factors by which one step and two half as long multiply a deviation: that of Euler-Maruyama
 # steps whose length times the rate is 0.4.
 _LEAST_DIFFERENCE = 0.04
+# The same of steps that are unstable, whose length times the rate is 2.
+_UNSTABLE = 1.0
 _MOST_SHIFT = 1.0  # standard deviations
 _ROUNDING = 1e-12  # of the mean, for the standard deviation of draws that are all the same
 
@@ -29,34 +33,51 @@ Array = NDArray[np.float64]
 def step_warnings(tree: DataTree, model: Model) -> list[SamplerWarning]:
     """Warn of integration steps that are too long for the equations at the draws."""
     accuracy = step_accuracy(model)
-    if accuracy is None or not (lengths := step_lengths(model)):
+    if accuracy is None:
         return []
     draws = unconstrained_draws(tree, model)
     draws = draws.reshape(-1, draws.shape[-1])
-    if accuracy(_some(draws, _N_POINTS)).max() < _LEAST_DIFFERENCE:
+    differences = accuracy(_some(draws, _N_POINTS))
+    if differences.max() < _LEAST_DIFFERENCE:
         return []
-    if (densities := densities_by_steps(model)) is None:
+    if np.median(differences) >= _UNSTABLE:
+        found = "a single one multiplies small deviations otherwise than two half as long"
+    elif (shift := _shift(model, _some(draws, _N_DRAWS))) >= _MOST_SHIFT:
+        found = (
+            f"with steps half as long the posterior would move by {shift:.1f} standard deviations "
+            "or more"
+        )
+    else:
         return []
-    x = _some(draws, _N_DRAWS)
+    return [
+        sampler_warning(
+            f"The integration steps of {max(step_lengths(model)):g} are too long for the equations "
+            f"here: {found}. Take four times as many substeps, or an integrator of higher order, "
+            "until this is no longer said; psf.step_error measures what is left."
+        )
+    ]
+
+
+def _shift(model: Model, x: Array) -> float:
+    """How far draws (n, k) move by half the step, in standard deviations; 0 if that is unknown.
+
+    With a noisy filter it is: others than the filter of the draws may be far off.
+    """
+    if noisy_filters(model):
+        return 0.0
+    try:
+        densities = densities_by_halvings(model, 1)
+    except ModelError:  # a filter that does not take the system with substeps
+        return 0.0
     coarse, fine = (RowFunction(model, density).evaluate(x) for density in densities)
     is_known = np.isfinite(coarse)
     if not (is_known & np.isfinite(fine)).any():
-        return []
+        return 0.0
     weights = softmax((fine - coarse)[is_known])
     mean, spread = x[is_known].mean(axis=0), x[is_known].std(axis=0)
     varies = spread > _ROUNDING * np.abs(mean)
     moved = np.abs(weights @ x[is_known] - mean)[varies] / spread[varies]
-    shift = float(np.nan_to_num(moved).max(initial=0.0))
-    if shift < _MOST_SHIFT:
-        return []
-    return [
-        sampler_warning(
-            f"The integration steps of {max(lengths):g} are too long for the equations here: with "
-            f"steps half as long the posterior would move by {shift:.1f} standard deviations or "
-            "more. Raise substeps, such as substeps=4, or take an integrator of higher order; "
-            "psf.step_error tells whether they are short enough."
-        )
-    ]
+    return float(np.nan_to_num(moved).max(initial=0.0))
 
 
 def _some(draws: Array, count: int) -> Array:
