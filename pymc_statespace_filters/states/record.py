@@ -110,8 +110,9 @@ class RecordAtDraws:
         if len(rows[0]) < n_input_rows(system, axis.steps) and system.n_inputs:
             raise ModelError(
                 f"{self.prefix}the model's inputs end after {len(rows[0])} rows, and step "
-                f"{axis.steps[-1]} needs {n_input_rows(system, axis.steps)}: give inputs= for all "
-                "steps, from step 0 on, or from the first time on with input_times="
+                f"{axis.steps[-1]} needs {n_input_rows(system, axis.steps)}: give inputs= for the "
+                "steps after the data alone, or for all from step 0 on (of the model's inputs with "
+                "times, from the first time on with input_times=)"
             )
         if axis.starts is None:
             return with_columns(system, rows, axis)
