@@ -120,7 +120,7 @@ class TestShortfall:
 
     def test_of_the_evaluations_names_a_remedy(self):
         rng = np.random.default_rng(104)
-        posterior = gaussian(2, (4, 500), rng, noise_sd=2.5)
+        posterior = gaussian(2, (4, 500), rng, noise_sd=1.5)
         found = Importance(target_se=0.01).estimate(posterior, rng=rng)
         assert found.settings["n_proposals"] == MOST
         assert "come from the evaluations: draw more" in found.shortfall

@@ -98,7 +98,10 @@ def wait_for_a_checkpoint(folder, since):
     """Wait until chains have been stored after a time."""
 
     def is_stored():
-        stored = [path.stat() for path in folder.glob("run/chains.*/chain-*.segment")]
+        try:
+            stored = [path.stat() for path in folder.glob("run/chains.*/chain-*.segment")]
+        except FileNotFoundError:  # merged with another since it was listed
+            return False
         return sum(file.st_size for file in stored if file.st_mtime > since) > 10_000
 
     wait_until(is_stored)
