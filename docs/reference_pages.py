@@ -94,7 +94,6 @@ GROUPS = {
         "prior_sensitivity",
         "drift_evidence",
         "select_terms",
-        "relevance",
         "step_error",
         "reweight",
         "chib_jeliazkov",

@@ -8,7 +8,6 @@ The equations of FitzHugh and Nagumo for a voltage v and a recovery w, with nois
 are simulated and both states measured with errors of 0.1. The candidates are all monomials to
 degree three, ten for each equation; seven are there. The script compares
 
-* `relevance`: normal priors whose widths have the largest evidence;
 * `select_terms`: the probability of each term, averaged over sub-models;
 * a regularised horseshoe (Piironen and Vehtari 2017), a prior that shrinks small coefficients,
   sampled by NUTS.
@@ -110,10 +109,6 @@ def study(args: argparse.Namespace) -> tuple[pd.DataFrame, xr.DataTree]:
     seconds["draws"] = time.process_time() - began
 
     began = time.process_time()
-    relevant = psf.relevance(idata, model, list(TRUTH), **quiet)
-    seconds["relevance"] = time.process_time() - began
-
-    began = time.process_time()
     selected = psf.select_terms(model, dict.fromkeys(TRUTH, 0.0), idata=idata, **quiet)
     seconds["select_terms"] = time.process_time() - began
 
@@ -128,8 +123,6 @@ def study(args: argparse.Namespace) -> tuple[pd.DataFrame, xr.DataTree]:
             "true": [TRUTH[name].get(term, 0.0) for name in TRUTH for term in terms.names],
             "inclusion": selected["terms"]["inclusion"],
             "se": selected["terms"]["inclusion_se"],
-            "relevance": relevant["relevance"].to_numpy(),
-            "gain": relevant["gain"].to_numpy(),
             "horseshoe 5 %": low,
             "95 %": high,
         },

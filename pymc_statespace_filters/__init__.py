@@ -44,6 +44,7 @@ _INSTEAD = {
 } | {
     "DimensionCorrection": "has gone: give compare_evidence a model_prior",
     "marginal_modes": "has gone: use arviz.mode",
+    "relevance": "has gone: use select_terms",
 }
 
 

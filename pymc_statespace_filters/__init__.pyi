@@ -76,7 +76,6 @@ from .system.panel_frame import panel_from
 from .system.stationary import stationary
 from .system.steps import nearest_steps
 from .terms import select_terms
-from .terms.relevance import relevance
 
 __version__: str
 
@@ -143,7 +142,6 @@ __all__ = [
     "plot_states",
     "plot_terms",
     "prior_sensitivity",
-    "relevance",
     "reweight",
     "run_filter",
     "run_models",

@@ -68,7 +68,7 @@ def select_terms(
         Prior of the sub-models. ``"beta-binomial"``: each number of terms is as probable as any
         other, and so are all sets of one size. A number: the probability of each term,
         independently of the others; or such a number for each candidate, where 0 is always absent
-        and 1 always present, as in the attribute ``inclusion`` of the table of `relevance`.
+        and 1 always present.
     requires : mapping, optional
         For a candidate another one, or a list of them, without which it is not considered:
         ``{"k3": "k1"}``. The prior is restricted to the sub-models that remain.

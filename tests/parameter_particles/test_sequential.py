@@ -172,7 +172,6 @@ def test_states_and_forecasts_follow_from_the_draws(by_filter):
         lambda *of: psf.forecast(*of, n_steps=2, random_seed=1, progressbar=False),
         lambda *of: psf.filtered_states(*of, random_seed=1, progressbar=False),
         lambda *of: psf.estimate_evidence(*of, random_seed=1, progressbar=False),
-        lambda *of: psf.relevance(*of, ["a"], random_seed=1, progressbar=False),
         lambda *of: psf.check_filter(*of, random_seed=1, progressbar=False),
     ],
 )

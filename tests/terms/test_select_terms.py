@@ -155,7 +155,6 @@ def test_draws_are_averaged_over_sub_models():
         psf.chib_jeliazkov,
         lambda found, model: psf.reweight(found, model, filter=psf.BootstrapPF(10)),
         lambda found, model: psf.drift_evidence(found, model, var_names="b3"),
-        lambda found, model: psf.relevance(found, model, ["b0"]),
         lambda found, model: psf.prior_sensitivity({"m": found}, models={"m": model}),
         lambda found, model: psf.select_terms(model, {"b0": 0.0}, idata=found),
     ],
