@@ -32,7 +32,6 @@ GROUPS = {
         "mechanics.freeplay",
         "mechanics.hysteresis",
         "mechanics.hysteresis_branch",
-        "mechanics.linear_modes",
         "mechanics.polynomial_terms",
     ),
     "Parts of Markov chains": ("stationary",),

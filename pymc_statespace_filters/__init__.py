@@ -32,7 +32,6 @@ _MOVED = {
         "freeplay",
         "hysteresis",
         "hysteresis_branch",
-        "linear_modes",
         "second_order",
     ),
     "point_estimation": ("MaximumLikelihoodEstimate",),
@@ -42,6 +41,7 @@ _INSTEAD = {
     for module, names in _MOVED.items()
     for name in names
 } | {
+    "linear_modes": "has gone: the how-to on validation has it in ten lines",
     "DimensionCorrection": "has gone: give compare_evidence a model_prior",
     "marginal_modes": "has gone: use arviz.mode",
     "relevance": "has gone: use select_terms",

@@ -257,24 +257,6 @@ def test_names_that_are_no_states_are_refused():
         rate_and_total(accumulators=["total", "total"])
 
 
-def test_modes_and_rest_points_leave_accumulators_out():
-    """An SIR-like flow never comes to rest as long as its total grows."""
-    integrator = psf.EulerMaruyama(lambda x, k: [1.0 - k * x[0], k * x[0]], [[0.1], [0.1]], dt=0.1)
-    settings = dict(
-        observation=lambda x: [x[1]], observation_noise=[[1.0]], initial_mean=[0.0, 0.0],
-        initial_cov=np.eye(2), accumulators=["x1"],
-    )  # fmt: skip
-    modes = psf.mechanics.linear_modes(psf.StateSpaceModel(integrator, **settings), {"k": 2.0})
-    np.testing.assert_allclose(modes["growth_rate"], [-2.0])
-    assert modes.attrs["at"]["x0"] == pytest.approx(0.5)
-    in_steps = psf.StateSpaceModel(
-        lambda x, q, k: [x[0] + 0.1 * (1.0 - k * x[0]) + q[0], x[1] + k * x[0]],
-        process_noise=[[0.1]], dt=0.1, **settings,
-    )  # fmt: skip
-    modes = psf.mechanics.linear_modes(in_steps, {"k": 2.0})
-    np.testing.assert_allclose(modes["growth_rate"], [np.log(0.8) / 0.1])
-
-
 def test_a_reset_happens_once_in_a_step_of_substeps_and_is_no_overshoot():
     integrator = psf.EulerMaruyama(
         lambda x, k: [-k * x[0], k * x[0]], [[0.0], [0.0]], dt=1.0, substeps=4
