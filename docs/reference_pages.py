@@ -101,7 +101,6 @@ GROUPS = {
     "Plots": (
         "plot_states",
         "plot_forecast",
-        "plot_phase",
         "plot_predictive",
         "plot_residuals",
         "plot_filter_health",

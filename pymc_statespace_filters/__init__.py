@@ -44,6 +44,7 @@ _INSTEAD = {
     "linear_modes": "has gone: the how-to on validation has it in ten lines",
     "DimensionCorrection": "has gone: give compare_evidence a model_prior",
     "marginal_modes": "has gone: use arviz.mode",
+    "plot_phase": "has gone: plot a state of idata['smoothed_states'] against another",
     "relevance": "has gone: use select_terms",
 }
 

@@ -5,7 +5,6 @@ from .drift import plot_drift
 from .evidence import plot_evidence, plot_model_probabilities
 from .filter_health import plot_filter_health
 from .forecast import plot_forecast
-from .phase import plot_phase
 from .predictive import plot_predictive
 from .prequential import plot_prequential
 from .prior_sensitivity import plot_prior_sensitivity
@@ -20,7 +19,6 @@ __all__ = [
     "plot_filter_health",
     "plot_forecast",
     "plot_model_probabilities",
-    "plot_phase",
     "plot_predictive",
     "plot_prequential",
     "plot_prior_sensitivity",

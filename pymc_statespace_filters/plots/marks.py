@@ -157,13 +157,6 @@ def _broken_line(x: Any, y: Any, target: Any, **kwargs: Any) -> Any:
     return backend_from_object(target).line(x.T.ravel(), y.T.ravel(), target, **kwargs)
 
 
-def path_xy(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
-    """Draw each path as a line, with x and y along the dimension "plot_axis"."""
-    dim = _dim_of(da, "path", "plot_axis")
-    x, y = da.transpose("plot_axis", dim, "path").values
-    return _broken_line(x, y, target, **kwargs)
-
-
 def points_xy(da: xr.DataArray, target: Any, *, diameter: float, **kwargs: Any) -> Any:
     """Draw points, with x and y along the dimension "plot_axis"."""
     x, y = da.stack(point=[dim for dim in da.dims if dim != "plot_axis"]).values

@@ -13,17 +13,12 @@ from pymc_statespace_filters import (
     plot_filter_health,
     plot_forecast,
     plot_model_probabilities,
-    plot_phase,
     plot_prior_sensitivity,
     plot_residuals,
     plot_states,
     plot_terms,
 )
 from tests.plots.test_terms import TERMS
-
-
-def portrait(idata, **settings):
-    return plot_phase(idata, "position", "speed", **settings)
 
 
 def run_free(idata, **settings):
@@ -45,7 +40,6 @@ PLOTS = [
     (plot_average, "average_in_panels"),
     (plot_states, "states"),
     (plot_forecast, "forecast"),
-    (portrait, "states"),
     (plot_filter_health, "diagnostics"),
     (plot_residuals, "diagnostics_with_inputs"),
     (plot_states, "simulated"),

@@ -8,7 +8,6 @@ import xarray as xr
 from pymc_statespace_filters import (
     plot_filter_health,
     plot_forecast,
-    plot_phase,
     plot_predictive,
     plot_residuals,
     plot_states,
@@ -207,8 +206,6 @@ def test_what_is_refused(states):
     alone = xr.DataTree.from_dict({"smoothed_states": alone})
     with pytest.raises(ModelError, match="records must be None, because 'd' is no panel"):
         plot_states(alone, records=["A"], backend="none")
-    with pytest.raises(ModelError, match="record must be None, because 'd' is no panel"):
-        plot_phase(alone, "level", "level", record="A", backend="none")
 
 
 @pytest.mark.parametrize("known_by", ["draws", "model", None])
@@ -244,7 +241,7 @@ def test_one_word_for_one_record_and_one_for_several(plot):
     with pytest.raises(TypeError, match="has no argument 'record': give records="):
         plot(None, record="A")
     with pytest.raises(TypeError, match="has no argument 'records': give record="):
-        plot_phase(None, "x", "y", records=["A"])
+        plot_residuals(None, records=["A"])
 
 
 NAMES = ["Mount Pleasant Elementary School", "Lake Constance (Bregenz gauge)", "x", "Patient 12"]
