@@ -113,6 +113,10 @@ def test_each_draw_has_its_own_parameters(way):
     assert np.isposinf(group["d_n_effective"]).all()
 
 
+# The states that the observables are, as JSON.
+SEEN = '{"x0": "position", "x1": "speed"}'
+
+
 @pytest.mark.parametrize("at", ["observations", "steps"])
 def test_smoothed_states_know_the_whole_record(at):
     rows = {"observations": STEPS, "steps": ALL_STEPS}[at]
@@ -121,15 +125,16 @@ def test_smoothed_states_know_the_whole_record(at):
     group = idata["smoothed_states"]
     assert_exact(group, laws_of(partial(pair_law, "smoothed", rows), A))
     assert group.attrs["at"] == at
-    attrs = group["d_states"].attrs
-    assert attrs == {"filter": "EKF()", "smoothing": EKF.smoothing_method(compile_system(PAIR))}
+    smoothing = EKF.smoothing_method(compile_system(PAIR))
+    attrs = {"filter": "EKF()", "smoothing": smoothing, "observables": SEEN}
+    assert group["d_states"].attrs == attrs
 
 
 def test_at_observations_by_default():
     group = psf.filtered_states(posterior(a=A), pair_model())["filtered_states"]
     assert_exact(group, laws_of(partial(pair_law, "filtered", STEPS), A))
     assert group.attrs["at"] == "observations"
-    assert group["d_states"].attrs == {"filter": "EKF()"}
+    assert group["d_states"].attrs == {"filter": "EKF()", "observables": SEEN}
 
 
 def test_draws_in_another_order_of_dimensions():
