@@ -90,7 +90,7 @@ class StudentMixture:
         there = replace(self, means=self.means[:, given], chols=np.linalg.cholesky(marginal))
         log_weights = there.log_joint(values[None])[:, 0]
         weights = np.exp(log_weights - logsumexp(log_weights))
-        # The units of coordinates may differ by any factor, beside which rounding is no matter.
+        # The units of coordinates may differ by any factor, so each has a floor of its own.
         units = np.sqrt(np.diagonal(scales[:, kept][:, :, kept], axis1=1, axis2=2))[:, :, None]
         factors = units * _factors(left / units / np.swapaxes(units, 1, 2))
         return replace(self, weights=weights, means=means, chols=factors)
