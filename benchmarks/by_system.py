@@ -19,7 +19,7 @@ from scipy.stats import norm
 
 import pymc_statespace_filters as psf
 from benchmarks.by_system_records import Case, cases
-from pymc_statespace_filters.filters.recommendation import check_system_and_filter
+from pymc_statespace_filters.filters.checks import check_system_and_filter
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.system.given_record import GivenRecord

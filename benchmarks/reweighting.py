@@ -21,7 +21,7 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.filters.recommendation import short_form
+from pymc_statespace_filters.filters.written import short_form
 
 DRAWS = 1000  # of the fast filter, weighted
 WIDTH = 0.5  # of the prior of the logarithm of a scale

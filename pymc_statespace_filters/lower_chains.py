@@ -25,6 +25,20 @@ class LowerChain(NamedTuple):
         )
 
 
+def nats_below(
+    known: float, log_densities: Mapping[int, NDArray[np.float64]], n_parameters: int
+) -> float | None:
+    """By how many nats all chains stayed below a known level; None if they did not.
+
+    All levels are medians of log-densities: a few points may lie high and hold no mass, as in the
+    neck of a funnel.
+    """
+    if not log_densities or not np.isfinite(known):
+        return None
+    nats = known - max(float(np.median(values)) for values in log_densities.values())
+    return nats if nats > TOLERATED + n_parameters else None
+
+
 def lower_chains(
     log_densities: Mapping[int, NDArray[np.float64]], n_parameters: int
 ) -> list[LowerChain]:

@@ -10,16 +10,16 @@ from typing import Any, Literal, overload
 
 import numpy as np
 from pymc.model import Model
-from pymc.stats.convergence import log_warnings
 from xarray import DataTree
 
 from .errors import ModelError
+from .facts import tell
 from .former_names import former_names
 from .parallel.signals import keeps_what_is_there, unless_interrupted
 from .parameter_particles import sample_smc
 from .sampling.checkpoint.checkpoint import checked_folder, folder_name
 from .sampling.chosen_sampler import sample, sample_named
-from .sampling.output.report import no_draws_warning
+from .sampling.output.facts import WithoutDraws
 from .sampling.run.driver import sample_models
 from .sampling.run.request import RunArguments
 from .sampling.run.stopping import AUTO
@@ -193,5 +193,7 @@ def _one_by_one(
     for name, model in models.items():
         unless_interrupted(partial(add, name, model), None)
     if found:
-        log_warnings([no_draws_warning(name) for name in models if name not in found])
+        for name in models:
+            if name not in found:
+                tell(WithoutDraws(name))
     return found or None

@@ -9,9 +9,9 @@ import numpy as np
 
 from ..compiler.numerics.philox import seeds_of_records
 from ..errors import DataMismatchError, ModelError
+from ..filters.checks import check_system_and_filter, tell_of_choice
 from ..filters.outcomes import COLLAPSED, NONE
 from ..filters.protocol import BatchFilter, Filter
-from ..filters.recommendation import check_system_and_filter
 from ..filters.signatures import PANEL, POINTS
 from ..ops.base import HEALTH_SIZE, evaluator
 from ..ops.distributed import check_ranks, distributed_evaluator
@@ -23,7 +23,7 @@ from ..system.model import StateSpaceModel
 from ..system.panel import CheckedPanel, checked_panel
 from ..system.parameters import flat_parameters, panel_parameters
 from ..system.record import check_seed, checked_record
-from .filter_warnings import warn_about, warn_of_choice
+from .health import tell_of_health
 
 
 def log_likelihood(
@@ -110,7 +110,7 @@ def log_likelihood(
     (2,)
     """
     check_system_and_filter(system, filter)
-    warn_of_choice(system, filter)
+    tell_of_choice(system, filter)
     given = GivenRecord(observed, panel, steps, times, inputs, t0, unit, input_times, inputs_at)
     if panel is not None:
         return _of_panel(system, filter, params, given, seed, comm, cores)
@@ -136,7 +136,7 @@ def log_likelihood(
         terms, health = _evaluate(system, filter, points, record, seeds.ravel(), ranks)
         if ranks.rank == 0:
             flat = seeds.ravel()
-            warn_about(system, filter, health, lambda i: (points[i], *record, flat[i]))
+            tell_of_health(system, filter, health, lambda i: (points[i], *record, flat[i]))
     return terms.reshape(*shape, record[0].size)
 
 
@@ -188,7 +188,7 @@ def _warn_of_records(
     arguments = [(own, *record, own_seed) for own, record, own_seed in parts]
     health = np.array([evaluate(*each)[1] for each in arguments])
     labels = table.records.labels
-    warn_about(system, filter, health, lambda g: arguments[g], labels=labels)
+    tell_of_health(system, filter, health, lambda g: arguments[g], labels=labels)
 
 
 def _check_agreement(ranks: Communicator, filter: Filter, arrays: Sequence[np.ndarray]) -> None:

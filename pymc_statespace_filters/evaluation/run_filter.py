@@ -11,8 +11,8 @@ import xarray as xr
 
 from ..compiler.numerics.philox import seeds_of_records
 from ..errors import ModelError
+from ..filters.checks import check_system_and_filter, tell_of_choice
 from ..filters.protocol import Filter, check_states_filter, properties
-from ..filters.recommendation import check_system_and_filter
 from ..ops.base import evaluator
 from ..ops.states import FilterRun, ResumableRun, States
 from ..system.clock import Clock
@@ -25,7 +25,7 @@ from ..system.parameters import flat_parameters, panel_parameters
 from ..system.placement import Earlier
 from ..system.record import CheckedRecord, check_seed, checked_record
 from ..system.steps import check_at, rows_at
-from .filter_warnings import warn_about, warn_of_choice
+from .health import tell_of_health
 
 STATE, _RECORD, _RESETS = "filter_state", "filter_state_record", "accumulators_reset"
 
@@ -124,7 +124,7 @@ def run_filter(
     Frozen({'time': 2, 'particle': 500, 'state': 1})
     """
     check_system_and_filter(system, filter)
-    warn_of_choice(system, filter)
+    tell_of_choice(system, filter)
     check_at(at)
     noise = check_seed("seed", seed)
     if noise.ndim:
@@ -178,7 +178,7 @@ def run_filter(
         evaluate = evaluator(FilterRun(system, filter))
         runs = [evaluate(*each, own) for each, own in zip(arguments, rows, strict=True)]
     terms, health, *states = (list(parts) for parts in zip(*runs, strict=True))
-    warn_about(system, filter, np.array(health), lambda i: arguments[i], labels=labels)
+    tell_of_health(system, filter, np.array(health), lambda i: arguments[i], labels=labels)
     row_dim, term_dim = ("time", "obs_time") if panel is None else ("row", "obs")
     dataset = _dataset(system, row_dim, *map(np.concatenate, states))
     dataset = dataset.assign(log_likelihood=(term_dim, np.concatenate(terms)))

@@ -8,8 +8,9 @@ import pymc as pm
 from numpy.typing import NDArray
 
 from ..errors import ModelError
+from ..filters.checks import check_unbiased
 from ..filters.protocol import Filter
-from ..filters.recommendation import check_unbiased, short_form
+from ..filters.written import short_form
 from ..pymc_model.density import RowFunction, check_free_variables
 from ..pymc_model.filter_estimates import VariableAtPoints
 from ..pymc_model.inspection import state_space_nodes

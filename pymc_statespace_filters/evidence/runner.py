@@ -18,7 +18,7 @@ from ..filter_checks.checks import MORE_POINTS, check_at_end, doubts
 from ..filter_checks.checks import stored as stored_filter_checks
 from ..filter_checks.finding import OFF
 from ..filters.protocol import Filter
-from ..filters.recommendation import short_form
+from ..filters.written import short_form
 from ..parallel.shared_rows import by_first_rank
 from ..progress import row_progress
 from ..pymc_model.density import ModelDensity

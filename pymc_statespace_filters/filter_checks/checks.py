@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from ..compiler.lowering.compiled_system import compile_system
 from ..errors import ModelError
 from ..filters.bootstrap import BootstrapPF
+from ..filters.checks import check_system_and_filter
 from ..filters.protocol import Filter
 from ..filters.rbpf import RBPF
-from ..filters.recommendation import check_system_and_filter, short_form
+from ..filters.written import short_form
 from ..progress import row_progress
 from ..pymc_model.density import compile_raveled
 from ..pymc_model.elements import element_names

@@ -15,10 +15,10 @@ from scipy.special import logsumexp
 
 from ..compiler.lowering.compiled_system import compile_system
 from ..filters.bootstrap import BootstrapPF
+from ..filters.catalog import exact_filter, filters_for
 from ..filters.guided_pf import GuidedPF
 from ..filters.protocol import Filter
 from ..filters.rbpf import RBPF
-from ..filters.recommendation import exact_filter, filters_for
 from ..pymc_model.filter_estimates import VariableAtPoints
 from ..pymc_model.inspection import resized
 from .budget import Budget

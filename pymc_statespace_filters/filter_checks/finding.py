@@ -9,7 +9,7 @@ from ..filters.bootstrap import BootstrapPF
 from ..filters.guided_pf import GuidedPF
 from ..filters.protocol import Filter
 from ..filters.rbpf import RBPF
-from ..filters.recommendation import short_form
+from ..filters.written import short_form
 from ..pymc_model.inspection import resized
 from .estimates import Comparison, Estimates
 

@@ -4,61 +4,7 @@
 with members everything but its update; a filter of another kind satisfies `Filter` by itself.
 """
 
-from ..compiler.codegen.function_types import CompiledFunction
-from .bootstrap import BootstrapPF
-from .ekf import EKF
-from .enkf import EnKF
-from .ensemble.base import EnsembleFilterBase
-from .ensemble.loop import Outcome, ensemble_filter, failed
-from .ensemble.particle_filter import ParticleFilter, particle_filter
-from .finite_state import FiniteStateFilter
-from .grid import GridFilter
-from .guided_pf import GuidedPF
-from .imm import IMM
-from .iplf import IPLF
-from .pf_enkf import PFEnKF
-from .protocol import (
-    BatchFilter,
-    DifferentiableFilter,
-    EnsembleFilter,
-    Filter,
-    HealthFilter,
-    PredictionFilter,
-    RunFilter,
-    StatesFilter,
-    System,
-    ToleranceFilter,
-)
-from .rbpf import RBPF
-from .ukf import UKF
+import lazy_loader
 
-__all__ = [
-    "EKF",
-    "IMM",
-    "IPLF",
-    "RBPF",
-    "UKF",
-    "BatchFilter",
-    "BootstrapPF",
-    "CompiledFunction",
-    "DifferentiableFilter",
-    "EnKF",
-    "EnsembleFilter",
-    "EnsembleFilterBase",
-    "Filter",
-    "FiniteStateFilter",
-    "GridFilter",
-    "GuidedPF",
-    "HealthFilter",
-    "Outcome",
-    "PFEnKF",
-    "ParticleFilter",
-    "PredictionFilter",
-    "RunFilter",
-    "StatesFilter",
-    "System",
-    "ToleranceFilter",
-    "ensemble_filter",
-    "failed",
-    "particle_filter",
-]
+# A name is imported when it is first used, so that one filter does not load the others.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

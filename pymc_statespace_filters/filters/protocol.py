@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..compiler.codegen.function_types import CompiledFunction
+from ..compiler.codegen.function_types import CompiledFunction as CompiledFunction
 from ..compiler.native.plan import Plan
 from ..compiler.native.planned_function import PlannedFunction
 from ..errors import ModelError

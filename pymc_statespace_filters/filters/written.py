@@ -1,32 +1,35 @@
-"""A filter from its short form, ``GuidedPF(100, resample_below=0.4)``, which results store."""
+"""A filter as a user would write it, ``GuidedPF(100, resample_below=0.4)``, and back."""
 
 import ast
+from collections.abc import Iterable
+from dataclasses import MISSING, fields, is_dataclass
+from importlib import import_module
 from typing import Any
 
-from .bootstrap import BootstrapPF
-from .ekf import EKF
-from .enkf import EnKF
-from .finite_state import FiniteStateFilter
-from .grid import GridFilter
-from .guided_pf import GuidedPF
-from .imm import IMM
-from .iplf import IPLF
-from .pf_enkf import PFEnKF
 from .protocol import Filter
-from .rbpf import RBPF
-from .ukf import UKF
 
-_FILTERS: dict[str, Any] = {
-    one.__name__: one
-    for one in (
-        EKF, IMM, IPLF, RBPF, UKF, BootstrapPF, EnKF, FiniteStateFilter, GridFilter, GuidedPF,
-        PFEnKF,
-    )
-}  # fmt: skip
+
+def short_form(filter: Any) -> str:
+    """A filter as a user would write it: ``GuidedPF(100)``, without settings at their defaults."""
+    if not is_dataclass(filter) or isinstance(filter, type):
+        return str(filter)
+    arguments = []
+    for field in fields(filter):
+        value = getattr(filter, field.name)
+        if field.default is MISSING and not field.kw_only:
+            arguments.append(repr(value))
+        elif value != field.default:
+            arguments.append(f"{field.name}={value!r}")
+    return f"{type(filter).__name__}({', '.join(arguments)})"
+
+
+def listed(filters: Iterable[Filter]) -> str:
+    """The short forms of filters, with commas."""
+    return ", ".join(map(short_form, filters))
 
 
 def filter_from(text: str) -> Filter | None:
-    """The filter that `recommendation.short_form` has written; None of a user's own class.
+    """The filter that `short_form` has written; None of a user's own class.
 
     Examples
     --------
@@ -35,7 +38,7 @@ def filter_from(text: str) -> Filter | None:
     """
     try:
         return _value(ast.parse(text, mode="eval").body)
-    except (SyntaxError, ValueError, KeyError):
+    except (SyntaxError, ValueError, AttributeError):
         return None
 
 
@@ -45,4 +48,5 @@ def _value(node: ast.expr) -> Any:
         return ast.literal_eval(node)
     assert isinstance(node.func, ast.Name)
     settings = {one.arg: _value(one.value) for one in node.keywords if one.arg}
-    return _FILTERS[node.func.id](*map(_value, node.args), **settings)
+    kind = getattr(import_module(__package__), node.func.id)
+    return kind(*map(_value, node.args), **settings)

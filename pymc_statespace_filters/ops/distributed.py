@@ -25,8 +25,8 @@ from ..compiler.native.plan import (
 )
 from ..errors import ModelError
 from ..filters.protocol import EnsembleFilter, Filter
-from ..filters.recommendation import short_form
 from ..filters.signatures import LIKELIHOOD, SEEDED, Signature
+from ..filters.written import short_form
 from ..parallel.communicator import Communicator
 from ..system.model import StateSpaceModel
 from .base import evaluator

@@ -9,6 +9,7 @@ unless the filter evaluates records side by side (`filters.protocol.BatchFilter`
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import pytensor.tensor as pt
 from pytensor.gradient import DisconnectedType
@@ -23,8 +24,8 @@ from ..compiler.codegen.function_types import CompiledFunction
 from ..compiler.lowering.compiled_system import CompiledSystem, compile_system
 from ..compiler.native.plan import Plan
 from ..errors import GradientUnavailableError
+from ..facts import Fact, in_words
 from ..filters.protocol import BatchFilter, Compiled, DifferentiableFilter, EnsembleFilter
-from ..filters.recommendation import filters_for, listed, short_form
 from ..filters.signatures import (
     GRADIENT,
     LIKELIHOOD,
@@ -37,6 +38,7 @@ from ..filters.signatures import (
     TAPED,
     Signature,
 )
+from ..filters.written import short_form
 from .base import HEALTH_SIZE, FilterOp, theta_cotangent_only
 from .unplanned import gradients_one_by_one, values_one_by_one
 
@@ -87,17 +89,23 @@ class LogLikelihood(FilterOp):
         return LogLikelihoodGradient(self.system, self.filter, self.form)
 
 
+@dataclass(frozen=True)
+class NoGradient(Fact):
+    """A likelihood has no gradient; in words, which filters of the system have one."""
+
+    system: CompiledSystem
+
+
 def check_has_gradient(op: LogLikelihood) -> None:
     """Raise, and name samplers that need none, unless the likelihood has a gradient."""
     if op.filter.has_gradient:
         return
     what = "is a random estimate without a" if op.filter.noisy else "does not come with a"
-    with_gradient = listed(f for f in filters_for(compile_system(op.system)) if f.has_gradient)
-    remedy = f", or take a filter with a gradient: {with_gradient}" if with_gradient else ""
+    remedy = in_words(NoGradient(compile_system(op.system)))
     raise GradientUnavailableError(
         f"The likelihood by {short_form(op.filter)} {what} gradient, so NUTS, HMC, "
         f"nutpie and find_MAP cannot use it. Sample with psf.sample_dram() or "
-        f"pm.sample(step=psf.DRAM()){remedy}."
+        f"pm.sample(step=psf.DRAM()){f', or {remedy}' if remedy else ''}."
     )
 
 

@@ -4,13 +4,12 @@ from collections.abc import Sequence
 
 import pymc as pm
 import xarray as xr
-from pymc.stats.convergence import log_warnings
 
-from ..filter_checks.checks import doubts, kept, store
+from ..facts import tell
+from ..filter_checks.checks import kept, store
+from ..filter_checks.facts import FilterOutcomes, UsedFilters
 from ..filters.protocol import Filter
 from ..parallel.shared_rows import by_first_rank
-from ..parallel.signals import unless_interrupted
-from ..sampling.output.filter_check import FilterCheck, check_filters, warn_of_filters
 from .output import DoubtsOf
 from .request import Request
 
@@ -22,17 +21,9 @@ def checked_at_end(model: pm.Model, request: Request, *, progressbar: bool) -> D
 
     def doubts_of(tree: xr.DataTree, filter: Filter | None, seconds: float) -> Sequence[str]:
         n_particles, rng = request.draws * request.n_populations, request.generator(_CHECK)
-
-        def check() -> FilterCheck:
-            return check_filters(tree, model, n_particles, seconds, rng, filter)
-
-        def say() -> Sequence[str]:
-            found = unless_interrupted(check, FilterCheck())
-            log_warnings(found.messages("info" if progressbar else "debug"))
-            warn_of_filters(found.warned)
-            return found.warned
-
-        return by_first_rank(say)
+        level = "info" if progressbar else "debug"
+        fact = UsedFilters(tree, model, n_particles, seconds, rng, filter, level)
+        return by_first_rank(lambda: tell(fact))
 
     return doubts_of
 
@@ -45,9 +36,7 @@ def kept_from(former: xr.DataTree) -> DoubtsOf:
         if not (outcomes := kept(former, filter)):
             return ()
         store(tree, outcomes)
-        found = doubts(outcomes)
-        warn_of_filters(found)
-        return found
+        return tell(FilterOutcomes(outcomes))
 
     return doubts_of
 

@@ -14,7 +14,7 @@ from ..evidence.estimators.maximum_likelihood import max_log_likelihood
 from ..evidence.observed_data import observed_in
 from ..evidence.posterior import Posterior
 from ..filters.protocol import Filter
-from ..filters.recommendation import short_form
+from ..filters.written import short_form
 from ..parallel.shared_rows import by_first_rank, outlasting_interrupts
 from ..parallel.signals import keeps_what_is_there
 from ..progress import stage_progress

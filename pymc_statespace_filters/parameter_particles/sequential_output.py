@@ -5,13 +5,12 @@ from time import perf_counter
 
 import numpy as np
 import xarray as xr
-from pymc.stats.convergence import SamplerWarning, log_warnings
+from pymc.stats.convergence import SamplerWarning, WarningType, log_warnings
 
 from ..evidence.observed_data import Observed
-from ..filters.recommendation import short_form
+from ..filters.written import short_form
 from ..progress import stage_progress
 from ..pymc_model.posterior_draws import SEQUENTIAL
-from ..sampling.output.warnings import sampler_warning
 from .observed_rows import ObservedRows
 from .output import COURSE, DoubtsOf, as_datatree
 from .request import Request
@@ -72,10 +71,11 @@ def finished(
 
 
 def _interrupted_warning(n_seen: int, n_rows: int) -> SamplerWarning:
-    return sampler_warning(
+    text = (
         f"The run was interrupted: the result knows {n_seen} of {n_rows} observations. "
         "psf.extend goes on from there."
     )
+    return SamplerWarning(WarningType.CONVERGENCE, text, "warn")
 
 
 def _observed(rows: ObservedRows) -> Observed:

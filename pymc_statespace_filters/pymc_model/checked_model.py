@@ -10,8 +10,7 @@ import xarray as xr
 from ..compiler.lowering.compiled_system import compile_system
 from ..compiler.native.compilation import COMPILATION
 from ..errors import DataMismatchError, ModelError
-from ..filters.recommendation import short_form
-from ..filters.written import filter_from
+from ..filters.written import filter_from, short_form
 from .density import ModelDensity
 from .fingerprint import model_data_fingerprint, model_fingerprint
 from .inspection import state_space_nodes

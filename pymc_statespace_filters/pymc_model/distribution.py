@@ -13,9 +13,10 @@ from pytensor.tensor.variable import TensorVariable
 
 from ..compiler.lowering.compiled_system import compile_system
 from ..errors import ModelError
-from ..evaluation.filter_warnings import warn_of_choice
+from ..facts import in_words
+from ..filters.checks import Refusal, check_system_and_filter, tell_of_choice
 from ..filters.protocol import Filter, properties
-from ..filters.recommendation import alternatives, check_system_and_filter, short_form
+from ..filters.written import short_form
 from ..system.checks import is_integer
 from ..system.clock import Clock
 from ..system.given_record import GivenRecord
@@ -172,7 +173,7 @@ class StateSpace(Continuous):
         values = dict(system.defaults) | _model_variables(system, model) | dict(own)
         system = system.with_known(known_elements(system, values))
         check_system_and_filter(system, filter)
-        warn_of_choice(system, filter)
+        tell_of_choice(system, filter)
         others = tuple(model.named_vars)
         full_name = model.name_for(name)
         _check_name(model, full_name, name, system)
@@ -301,7 +302,7 @@ def _check_score_from(
         raise ModelError(
             f"score_from must be 0 with {short_form(filter)}, which places its particles for the "
             f"whole record and misjudges a part of it, got {score_from}; "
-            f"{alternatives(compile_system(system), filter)}"
+            f"{in_words(Refusal(compile_system(system), filter))}"
         )
     return int(score_from)
 

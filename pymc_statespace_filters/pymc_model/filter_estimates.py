@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import ancestors
 
+from ..filters.checks import check_system_and_filter
 from ..filters.outcomes import Failure
 from ..filters.protocol import Filter
-from ..filters.recommendation import check_system_and_filter
 from ..filters.signatures import ONE_RECORD, PANEL
 from ..ops.base import evaluator
 from ..ops.likelihood import LogLikelihood

@@ -15,10 +15,10 @@ from pytensor.tensor.variable import TensorVariable
 
 from ..compiler.lowering.compiled_system import compile_system
 from ..errors import ModelError
+from ..filters.checks import check_system_and_filter, takes
 from ..filters.ekf import EKF
 from ..filters.iplf import IPLF
 from ..filters.protocol import EnsembleFilter, Filter, ToleranceFilter
-from ..filters.recommendation import check_system_and_filter, takes
 from ..filters.signatures import PANEL
 from ..ops.distributed import CallbackLogLikelihood, CallbackLogLikelihoodOfNoise
 from ..ops.likelihood import LogLikelihood, LogLikelihoodOfNoise, StoredNoise

@@ -17,7 +17,7 @@ import pytensor
 from ..errors import INSIDE as PACKAGE
 from ..errors import FilterWarning
 from ..filters.protocol import Filter
-from ..filters.recommendation import short_form
+from ..filters.written import short_form
 
 _SAMPLERS = ("pymc.step_methods.", "pymc.smc.")
 # Those with gradients, of which there are none: an error says so.

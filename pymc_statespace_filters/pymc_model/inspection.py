@@ -17,7 +17,7 @@ from pytensor.tensor.variable import TensorVariable
 from ..compiler.lowering.compiled_system import compile_system
 from ..errors import ModelError
 from ..filters.protocol import Filter
-from ..filters.recommendation import collapse_remedy, quiet_filter, short_form
+from ..filters.written import short_form
 from ..ops.likelihood import LogLikelihood
 from ..system.panel_records import RECORD
 from .random_variable import PanelRV, StateSpaceRV
@@ -136,23 +136,6 @@ def filters_used(model: pm.Model) -> dict[str, str]:
     nodes = state_space_nodes(model)
     used = {name: short_form(node.op.filter) for name, node in nodes.items()}
     return {"filter": json.dumps(used)} if used else {}
-
-
-def collapse_remedies(model: pm.Model) -> str:
-    """What to do where particles collapse, for every noisy filter of the model."""
-    nodes = {name: state_space_nodes(model)[name].op for name in noisy_filters(model)}
-    remedies = {
-        name: collapse_remedy(compile_system(op.system), op.filter) for name, op in nodes.items()
-    }
-    if len(set(remedies.values())) <= 1:
-        return "".join(set(remedies.values()))
-    return " ".join(f"For {name!r}: {remedy}" for name, remedy in remedies.items())
-
-
-def quieter_filter(model: pm.Model, name: str) -> Filter | None:
-    """A filter of the same likelihood with little noise or none, for one variable."""
-    op = state_space_nodes(model)[name].op
-    return quiet_filter(compile_system(op.system), op.filter)
 
 
 def is_filter(value: object) -> bool:

@@ -10,8 +10,8 @@ from pymc.model.fgraph import fgraph_from_model, model_from_fgraph
 from pytensor.compile.sharedvalue import SharedVariable
 
 from ..errors import ModelError
+from ..filters.checks import check_system_and_filter
 from ..filters.protocol import Filter
-from ..filters.recommendation import check_system_and_filter
 from ..filters.written import filter_from
 from .inspection import filters_used, given_model, is_filter, state_space_nodes
 from .posterior_draws import BY_PARTICLES, check_same_rows

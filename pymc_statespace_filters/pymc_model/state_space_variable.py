@@ -8,6 +8,7 @@ import pymc as pm
 from pytensor.tensor.variable import TensorVariable
 
 from ..compiler.lowering.compiled_system import compile_system
+from ..filters.checks import check_system_and_filter
 from ..filters.protocol import (
     DifferentiableFilter,
     Filter,
@@ -15,7 +16,6 @@ from ..filters.protocol import (
     StatesFilter,
     check_states_filter,
 )
-from ..filters.recommendation import check_system_and_filter
 from ..ops.at_rows import at_rows
 from ..ops.base import FilterOp
 from ..ops.likelihood import LogLikelihood, TapedLogLikelihood

@@ -14,8 +14,8 @@ from pytensor.graph.traversal import ancestors
 from ..compiler.lowering.structure import parameters_after_start
 from ..compiler.native.rows import interpreted_at_points
 from ..errors import ModelError
-from ..filters.recommendation import short_form
 from ..filters.signatures import PANEL
+from ..filters.written import short_form
 from ..ops.base import evaluator
 from ..ops.likelihood import LogLikelihood
 from ..system.panel_records import FIRST_INPUT, N_COLUMNS, RECORD, STEP, records_of

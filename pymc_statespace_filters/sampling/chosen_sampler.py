@@ -16,7 +16,7 @@ from ..pymc_model.density import check_free_variables
 from ..pymc_model.inspection import given_model
 from .checkpoint.checkpoint import checked_folder
 from .choice import DRAM, NUTS, Choice, choose_sampler, why_no_nuts
-from .output.warnings import of_model
+from .output.facts import of_model
 from .run.continuation import appended, former_chains
 from .run.driver import sample_models
 from .run.request import RunArguments, SamplingRequest

@@ -10,16 +10,18 @@ from typing import Any
 
 import numpy as np
 from pymc.model import Model, modelcontext
-from pymc.stats.convergence import SamplerWarning
+from pymc.stats.convergence import SamplerWarning, WarningType
 from pymc.step_methods.compound import BlockedStep, StepMethodState
 from pymc.step_methods.state import dataclass_state
 from pymc.util import RandomGenerator, get_random_generator
 from pytensor.tensor.variable import TensorVariable
 
+from ..facts import sentences
 from ..progress import stat_values, step_columns
 from .kernel.state import ChainState, draw_key
 from .output import sample_stats
-from .output.warnings import PhaseStatistics, closing_warning
+from .output.facts import EndedChain
+from .output.phase_statistics import PhaseStatistics
 from .run.chain import Chain
 from .target.settings import RandomWalkSettings
 from .target.target import Target
@@ -244,7 +246,8 @@ class DRAM(BlockedStep):
     def _closing_warning(self) -> SamplerWarning | None:
         # Without the number of the chain, which PyMC does not pass to a step method.
         growth = self._target.growth(self._prepared_chain.state)
-        return closing_warning(self._statistics, growth, self._target.collapse_remedy)
+        found = sentences(EndedChain(self._target, self._statistics, growth))
+        return SamplerWarning(WarningType.BAD_ACCEPTANCE, found[0], "warn") if found else None
 
     def _reset(self, tune: int, draws: int) -> None:
         self.tune = tune > 0

@@ -18,7 +18,7 @@ from ..compiler.native.pytensor_function import NativeFunction
 from ..compiler.native.rows import Rows
 from ..compiler.numerics.philox import generators_of_records
 from ..errors import ModelError
-from ..evaluation.filter_warnings import warn_about
+from ..evaluation.health import tell_of_health
 from ..filters.outcomes import NONE
 from ..progress import row_progress
 from ..pymc_model.state_space_variable import (
@@ -131,7 +131,7 @@ class VariableAtDraws:
             number, draw = divmod(i, self.n_draws)
             return self.records[number].arguments(draw, seeds[number][draw])
 
-        warn_about(
+        tell_of_health(
             self.variable.system,
             self.variable.filter,
             np.concatenate(health),

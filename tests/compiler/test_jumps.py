@@ -6,9 +6,10 @@ import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.advice.choice import jump_problem
+from pymc_statespace_filters.advice.collapse import collapse_remedy
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.lowering.jumps import jumping_equations
-from pymc_statespace_filters.filters.recommendation import collapse_remedy, jump_problem
 from pymc_statespace_filters.pymc_model.graph_rewrites import pilot_filters, with_filter
 
 

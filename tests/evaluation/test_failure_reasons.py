@@ -9,8 +9,8 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.filters.catalog import FILTERS
 from pymc_statespace_filters.filters.outcomes import Failure
-from pymc_statespace_filters.filters.recommendation import FILTERS
 
 PARTICLES = (psf.GuidedPF(60), psf.BootstrapPF(60), psf.PFEnKF(60), psf.EnKF(60))
 GAUSSIAN = (psf.EKF(), psf.UKF(), psf.IPLF())

@@ -14,9 +14,9 @@ from scipy.stats import norm, poisson
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.filters.catalog import exact_filter
 from pymc_statespace_filters.filters.markov_chain.backward import _add
 from pymc_statespace_filters.filters.outcomes import Failure
-from pymc_statespace_filters.filters.recommendation import exact_filter
 from pymc_statespace_filters.filters.signatures import PANEL
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood

@@ -6,8 +6,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filters.recommendation import short_form
-from pymc_statespace_filters.filters.written import filter_from
+from pymc_statespace_filters.filters.written import filter_from, short_form
 from pymc_statespace_filters.pymc_model.other_filter import model_with
 from tests.modes import AS_IT_STANDS
 from tests.parameter_particles.autoregression import DATA, STEPS, exact, model

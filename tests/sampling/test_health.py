@@ -3,17 +3,21 @@
 import json
 import logging
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.advice import noise
+from pymc_statespace_filters.facts import sentences
 from pymc_statespace_filters.sampling import DRAM
 from pymc_statespace_filters.sampling.kernel import state
 from pymc_statespace_filters.sampling.output import likelihood_variance
-from pymc_statespace_filters.sampling.output.likelihood_variance import spread_of, start_warning
-from pymc_statespace_filters.sampling.output.warnings import PhaseStatistics, closing_warning
+from pymc_statespace_filters.sampling.output.facts import EndedChain, NoisyStart
+from pymc_statespace_filters.sampling.output.likelihood_variance import spread_of
+from pymc_statespace_filters.sampling.output.phase_statistics import PhaseStatistics
 from pymc_statespace_filters.sampling.target.target import Growth
 from tests.kernels import with_kernel
 from tests.sampling.test_dram import nan_beyond, sample, simple_model
@@ -121,18 +125,25 @@ def test_stays_are_counted_at_once_and_one_by_one(stages, longest):
     assert whole.longest_dwell == longest
 
 
+def said_of(statistics, growth=None, filter=None):
+    """The sentence about a chain, of a model with this filter; None if all is well."""
+    model = simple_model() if filter is None else state_space_model(filter)
+    (text, *_) = [*sentences(EndedChain(SimpleNamespace(model=model), statistics, growth)), None]
+    return text
+
+
 def test_a_stay_of_a_fifth_of_the_draws_is_said():
     moving = np.tile([1, 0], 400)
     stuck = np.concatenate([moving, [1], np.zeros(205, dtype=int), [1]])
-    assert closing_warning(PhaseStatistics.from_draws(draws_with(moving), 0, 800)) is None
+    assert said_of(PhaseStatistics.from_draws(draws_with(moving), 0, 800)) is None
     phase = PhaseStatistics.from_draws(draws_with(stuck), 0, len(stuck))
-    warning, of_noise = closing_warning(phase), closing_warning(phase, remedy="Use more.")
-    assert "stayed at one point for 206 of 1007 iterations" in warning.message
-    assert "more particles" not in warning.message
-    assert "more particles" in of_noise.message
+    text, of_noise = said_of(phase), said_of(phase, filter=psf.BootstrapPF(20))
+    assert "stayed at one point for 206 of 1007 iterations" in text
+    assert "more particles" not in text
+    assert "more particles" in of_noise
     # Of few draws a fifth is soon passed by chance.
     few = np.concatenate([moving[:100], np.zeros(90, dtype=int)])
-    assert closing_warning(PhaseStatistics.from_draws(draws_with(few), 0, len(few))) is None
+    assert said_of(PhaseStatistics.from_draws(draws_with(few), 0, len(few))) is None
 
 
 def test_a_chain_hardly_moves_below_the_rate_at_which_its_bar_turns_red():
@@ -140,14 +151,14 @@ def test_a_chain_hardly_moves_below_the_rate_at_which_its_bar_turns_red():
     stages[:: 6000 // 59] = 1
     record = PhaseStatistics.from_draws(draws_with(stages[:5950]), 0, 5950)
     assert record.moved == 59
-    assert "accepted 59 of 5950 proposals" in closing_warning(record).message
-    assert closing_warning(record._replace(iterations=5900)) is None
+    assert "accepted 59 of 5950 proposals" in said_of(record)
+    assert said_of(record._replace(iterations=5900)) is None
 
 
 def test_growth_below_the_limit_is_silent():
     record = PhaseStatistics.from_draws(draws_with(np.tile([1, 0], 400)), 0, 800)
-    assert closing_warning(record, Growth("x", 900.0)) is None
-    assert "proposals of x" in closing_warning(record, Growth("x", 1100.0)).message
+    assert said_of(record, Growth("x", 900.0)) is None
+    assert "proposals of x" in said_of(record, Growth("x", 1100.0))
 
 
 # The spread of the estimates over seeds.
@@ -191,10 +202,8 @@ def test_the_spread_is_measured_where_it_says_something(filter, settings):
 def test_spreads_far_outside_are_said(caplog, monkeypatch):
     model = state_space_model(psf.BootstrapPF(20))
     quiet = sample_dram(model, draws=700)
-    monkeypatch.setattr(likelihood_variance, "HOPELESS", 1e-3)
-    monkeypatch.setattr(
-        "pymc_statespace_filters.sampling.output.likelihood_variance.TOO_NOISY", 1e-3
-    )
+    monkeypatch.setattr(noise, "HOPELESS", 1e-3)
+    monkeypatch.setattr(noise, "TOO_NOISY", 1e-3)
     with caplog.at_level(logging.WARNING, logger=LOGGER):
         tree = sample_dram(model, draws=700)
     assert "at the start" not in caplog.text  # which the chains have left
@@ -204,7 +213,7 @@ def test_spreads_far_outside_are_said(caplog, monkeypatch):
 
 
 def test_a_noisy_start_is_said_where_the_chain_still_stands(caplog, monkeypatch):
-    monkeypatch.setattr(likelihood_variance, "HOPELESS", 1e-3)
+    monkeypatch.setattr(noise, "HOPELESS", 1e-3)
     model = state_space_model(psf.BootstrapPF(3))
     with caplog.at_level(logging.WARNING, logger=LOGGER):
         tree = sample_dram(
@@ -218,11 +227,15 @@ def test_a_noisy_start_is_said_where_the_chain_still_stands(caplog, monkeypatch)
 
 
 def test_a_noisy_start_may_be_left():
+
+    def said(estimates):
+        return sentences(NoisyStart(simple_model(), 3, spread_of(estimates)))
+
     noisy = 6.0 * np.random.default_rng(1).normal(size=12)
     assert 10.0 < spread_of(noisy).variance < likelihood_variance.HOPELESS
-    assert start_warning(spread_of(noisy), 3) is None
-    message = start_warning(spread_of(3.0 * noisy), 3).message
+    assert said(noisy) == []
+    (message,) = said(3.0 * noisy)
     assert message.startswith("Chain 3, at the start:")
     assert "initvals" in message
     assert "suggest_particles" in message
-    assert start_warning(spread_of(np.full(12, -np.inf)), 3) is None
+    assert said(np.full(12, -np.inf)) == []

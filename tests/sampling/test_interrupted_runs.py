@@ -9,10 +9,8 @@ import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.advice import filter_check, missed
 from pymc_statespace_filters.parallel.signals import interrupts_are_noted
-from pymc_statespace_filters.sampling.nuts import sample_nuts
-from pymc_statespace_filters.sampling.output.filter_check import FilterCheck
-from pymc_statespace_filters.sampling.run import model_result
 from tests.systems import PAIR, PAIR_DATA, STEPS
 
 pytestmark = pytest.mark.usefixtures("interrupts_arrive", "interpreted")
@@ -90,9 +88,8 @@ def long_check(found):
 
 @pytest.fixture
 def calls(monkeypatch):
-    for module in (model_result, sample_nuts):
-        monkeypatch.setattr(module, "unvisited_warnings", long_check([]))
-        monkeypatch.setattr(module, "check_filters", long_check(FilterCheck()))
+    monkeypatch.setattr(missed, "_missed_parts", long_check([]))
+    monkeypatch.setattr(filter_check, "_check", long_check(filter_check.FilterCheck()))
     both, record = {"one": conjugate(), "two": conjugate()}, rows()
     same = {"random_seed": 1, "progressbar": False}
     few = {"draws": 8, "tune": 0, "chains": 2, "cores": 1} | same

@@ -5,10 +5,12 @@ import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.advice import noise
+from pymc_statespace_filters.facts import sentences
+from pymc_statespace_filters.sampling.output.facts import NoisyStarts
 from pymc_statespace_filters.sampling.output.likelihood_variance import spread_of
-from pymc_statespace_filters.sampling.run import noise_at_starts, population_search
+from pymc_statespace_filters.sampling.run import population_search
 from pymc_statespace_filters.sampling.run.chain import Chain
-from pymc_statespace_filters.sampling.run.noise_at_starts import noise_warning
 from pymc_statespace_filters.sampling.starts.modes import Points
 from pymc_statespace_filters.sampling.target.settings import RandomWalkSettings
 from pymc_statespace_filters.sampling.target.target import Target
@@ -31,8 +33,8 @@ def said_of(filter):
     target = Target(model, None, RandomWalkSettings())
     target.prepare()
     found = Points(np.array([[0.9], [1.4], [1.9]]), np.array([-3.0, -1.0, -2.0]), np.zeros(3, int))
-    warning = noise_warning(model, target, found, np.random.default_rng(1))
-    return None if warning is None else warning.message
+    said = sentences(NoisyStarts(model, target, found, np.random.default_rng(1)))
+    return said[0] if said else None
 
 
 def test_a_filter_that_was_seen_to_do_is_named():
@@ -44,13 +46,13 @@ def test_a_filter_that_was_seen_to_do_is_named():
 
 def test_a_filter_that_takes_a_hundred_times_as_long(monkeypatch):
     spreads = iter([(spread_of(np.linspace(-9.0, 9.0, 12)), 1.0), (spread_of(np.zeros(12)), 123.4)])
-    monkeypatch.setattr(noise_at_starts, "_measured", lambda *_: next(spreads))
+    monkeypatch.setattr(noise, "_measured", lambda *_: next(spreads))
     assert "an evaluation takes 120 times as long" in said_of(psf.BootstrapPF(4))
 
 
 def test_a_filter_that_is_none_or_does_not_is_not_named(monkeypatch):
     for filters in (None, {"d": psf.BootstrapPF(3)}):
-        monkeypatch.setattr(noise_at_starts, "_quieter", lambda _, filters=filters: filters)
+        monkeypatch.setattr(noise, "_quieter", lambda _, filters=filters: filters)
         said = said_of(psf.BootstrapPF(4))
         assert "times as many would bring it between 1 and 3.3" in said
         assert "With" not in said
@@ -58,8 +60,8 @@ def test_a_filter_that_is_none_or_does_not_is_not_named(monkeypatch):
 
 def test_of_a_filter_with_a_bias_no_other_is_named():
     """Whose posterior would be another."""
-    assert noise_at_starts._quieter(seen_precisely(psf.EnKF(3))) is None
-    assert noise_at_starts._quieter(seen_precisely(psf.BootstrapPF(3))) == {"d": psf.EKF()}
+    assert noise._quieter(seen_precisely(psf.EnKF(3))) is None
+    assert noise._quieter(seen_precisely(psf.BootstrapPF(3))) == {"d": psf.EKF()}
 
 
 def test_nothing_is_said_of_noise_that_lets_chains_move():
@@ -69,7 +71,7 @@ def test_nothing_is_said_of_noise_that_lets_chains_move():
 def test_nothing_is_said_of_a_single_low_estimate(monkeypatch):
     low = spread_of(np.append(np.linspace(-1.0, 1.0, 11), -30.0))
     assert low.variance > 70.0
-    monkeypatch.setattr(noise_at_starts, "_measured", lambda *_: (low, 1.0))
+    monkeypatch.setattr(noise, "_measured", lambda *_: (low, 1.0))
     assert said_of(psf.BootstrapPF(1000)) is None
 
 
@@ -93,7 +95,7 @@ def test_it_is_said_before_the_chains_begin(tune, is_said, caplog, monkeypatch):
 @pytest.mark.parametrize("was_said", [True, False])
 def test_noise_that_was_named_is_not_named_again_at_the_end(was_said, caplog, monkeypatch):
     if not was_said:
-        monkeypatch.setattr(population_search, "noise_warning", lambda *_: None)
+        monkeypatch.setattr(noise, "_measured", lambda *_: (spread_of(np.zeros(12)), 1.0))
     tree = psf.sample_dram(
         10, 800, chains=2, model=seen_precisely(psf.BootstrapPF(4)), random_seed=1,
         progressbar=False, compute_convergence_checks=False,
@@ -114,7 +116,7 @@ def test_an_interrupt_of_the_measurement_loses_no_starts(tmp_path, monkeypatch):
         )  # fmt: skip
 
     with monkeypatch.context() as patched:
-        patched.setattr(population_search, "noise_warning", interrupted)
+        patched.setattr(noise, "_measured", interrupted)
         with pytest.raises(KeyboardInterrupt):
             run()
     monkeypatch.setattr(population_search, "find_population", None)

@@ -10,7 +10,7 @@ from pymc_statespace_filters import sample
 from pymc_statespace_filters.sampling import choice
 from pymc_statespace_filters.sampling.kernel.state import N_ACCEPTED, N_COUNTS, Draws
 from pymc_statespace_filters.sampling.output.convergence import convergence
-from pymc_statespace_filters.sampling.output.warnings import PhaseStatistics
+from pymc_statespace_filters.sampling.output.phase_statistics import PhaseStatistics
 from pymc_statespace_filters.sampling.run.thinned_draws import Thinning, add_iterations, coarsen
 from tests.kernels import with_kernel
 from tests.sampling.test_dram import simple_model

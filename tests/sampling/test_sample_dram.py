@@ -3,6 +3,7 @@
 import re
 import threading
 import time
+from types import SimpleNamespace
 
 import arviz as az
 import numpy as np
@@ -14,9 +15,9 @@ import xarray as xr
 from pytensor.compile.ops import wrap_py
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.advice import ended_dram
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling import DRAM
-from pymc_statespace_filters.sampling.output.report import left_out_warnings
 from tests.interrupts import interrupt_chains
 from tests.kernels import with_kernel
 from tests.modes import AS_IT_STANDS
@@ -347,10 +348,11 @@ def test_an_interrupt_returns_what_is_there(watched, monkeypatch, presses, tune)
     ],
 )
 def test_chains_left_out_are_named(lengths, skipped, said):
-    warnings = left_out_warnings(lengths, skipped)
-    assert [said in warning.message for warning in warnings] == [True] * (said is not None)
+    fact = SimpleNamespace(lengths=lengths, request=SimpleNamespace(n_skipped=skipped))
+    texts = ended_dram._left_out(fact)
+    assert [said in text for text in texts] == [True] * (said is not None)
     if said is not None:
-        assert warnings[0].message.endswith("chain 2 had not begun.")
+        assert texts[0].endswith("chain 2 had not begun.")
 
 
 @pytest.mark.usefixtures("interrupts_arrive")
@@ -376,12 +378,14 @@ def test_convergence_is_judged_if_it_is_asked_for(asked, caplog):
     assert caplog.text.count("Chains 0 and 1: DRAM accepted 0 of 100") == 1
 
 
-@pytest.mark.parametrize("last", ["spread_at_highest_draw", "check_filters"])
+@pytest.mark.parametrize(
+    "last", ["sampling.run.model_result.spread_at_highest_draw", "advice.filter_check._check"]
+)
 def test_an_interrupt_after_the_last_draw_keeps_all(noisy, monkeypatch, last):
     def interrupted(*arguments):
         raise KeyboardInterrupt
 
     expected = sample_dram(noisy, draws=300, tune=300)
-    monkeypatch.setattr(f"pymc_statespace_filters.sampling.run.model_result.{last}", interrupted)
+    monkeypatch.setattr(f"pymc_statespace_filters.{last}", interrupted)
     found = sample_dram(noisy, draws=300, tune=300)
     assert found["posterior"].equals(expected["posterior"])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.advice.noise import variance_advice
 from pymc_statespace_filters.sampling.kernel.state import Evaluation
 from pymc_statespace_filters.sampling.output.likelihood_variance import (
     MIDDLE,
@@ -11,7 +12,6 @@ from pymc_statespace_filters.sampling.output.likelihood_variance import (
     acceptance_share,
     seed_spread,
     spread_of,
-    variance_advice,
 )
 from pymc_statespace_filters.sampling.target.log_density import LogDensity
 from tests.sampling.noisy_toy import noisy_model

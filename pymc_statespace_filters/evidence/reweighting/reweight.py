@@ -14,7 +14,7 @@ from ...compiler.native.compilation import COMPILATION
 from ...errors import INSIDE, EvidenceWarning, FilterWarning, ModelError
 from ...filter_checks.checks import MORE_POINTS, check_at_end, doubts, store
 from ...filters.protocol import Filter
-from ...filters.recommendation import short_form
+from ...filters.written import short_form
 from ...importance import MIN_EFFECTIVE, largest_good_k, pareto_k
 from ...parallel.cpu_affinity import cores_set_to
 from ...parallel.shared_rows import by_first_rank

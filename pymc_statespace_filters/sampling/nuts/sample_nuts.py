@@ -1,27 +1,22 @@
 """A whole run of NUTS, from the request to the DataTree."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from pymc.initial_point import make_initial_point_fn
 from pymc.model import Model
-from pymc.stats.convergence import SamplerWarning, log_warnings
 from xarray import DataTree
 
 from ...errors import ModelError
+from ...facts import tell
 from ...parallel.cpu_affinity import available_cores
-from ...parallel.signals import keeps_what_is_there, unless_interrupted
+from ...parallel.signals import keeps_what_is_there
 from ...pymc_model.elements import element_names
 from ...pymc_model.inspection import exactness, filters_used
 from ..output.datatree import to_datatree
-from ..output.filter_check import FilterCheck, check_filters, warn_of_filters
-from ..output.step_check import step_warnings
-from ..output.unvisited import unvisited_warnings
-from ..output.warnings import of_model
+from ..output.facts import EndedNuts, SeparateModes, of_model
 from ..run.request import ExecutionOptions, SamplingRequest
-from ..starts.modes import modes_message, modes_warning
 from ..starts.population import find_population
 from ..target.initial_points import check_initvals
 from ..target.settings import RandomWalkSettings
@@ -29,7 +24,6 @@ from ..target.target import Target
 from ..target.variables import check_no_generators
 from .chains import NutsChains, run_nuts
 from .gradient import DensityGradient
-from .report import messages_of
 
 Array = NDArray[np.float64]
 
@@ -58,24 +52,25 @@ def sample_nuts(
     if not chains.positions.shape[1]:
         raise KeyboardInterrupt("the run was interrupted before there was a draw to return")
     tree = _tree(model, target, chains, request)
-    nothing: list[SamplerWarning] = []
-    missed = [
-        *unless_interrupted(
-            lambda: unvisited_warnings(tree, model, target.prior_draws, chains.seconds, rng),
-            nothing,
-        ),
-        *unless_interrupted(lambda: step_warnings(tree, model), nothing),
-    ]
-    iterations = request.tune + chains.length.n_iterations
-    check = unless_interrupted(
-        lambda: check_filters(tree, model, iterations, chains.seconds, rng), FilterCheck()
+    ended = EndedNuts(
+        model=model,
+        target=target,
+        request=request,
+        tree=tree,
+        names=element_names(model, target.raveled.variables),
+        length=chains.length,
+        seconds=chains.seconds,
+        convergence=chains.found,
+        positions=chains.positions.reshape(-1, target.raveled.dim),
+        rngs=(rng, rng),
+        is_checked=True,
+        level="info" if progressbar else "debug",
+        diverging=chains.statistics["diverging"],
+        energy=chains.statistics["energy"],
+        n_steps=chains.statistics["n_steps"],
+        is_stuck=chains.is_stuck,
     )
-    level = "info" if progressbar else "debug"
-    names = element_names(model, target.raveled.variables)
-    messages = messages_of(model, chains, missed, request, names, level)
-    said = [*messages, *check.messages(level)]
-    log_warnings([replace(one, message=of_model(name) + one.message) for one in said])
-    warn_of_filters([of_model(name) + text for text in check.warned])
+    tell(ended, of_model(name))
     return tree
 
 
@@ -133,6 +128,5 @@ def _start(
         return lambda own: centre + own.uniform(-width, width, centre.size)
     target.prepare()
     population = find_population(target, rng, progressbar=progressbar)
-    if (message := modes_message(model, target.raveled, population)) is not None:
-        log_warnings([modes_warning(of_model(name) + message)])
+    tell(SeparateModes(model, target.raveled, population), of_model(name))
     return lambda own: population.x[own.integers(len(population.x))]

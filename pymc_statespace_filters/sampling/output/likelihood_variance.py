@@ -22,14 +22,10 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from pymc.stats.convergence import SamplerWarning
 from scipy.special import stdtrit
 
-from ...filters.protocol import EnsembleFilter
-from ...filters.recommendation import speed_up
 from ..kernel.state import LOG_DENSITY, Draws, Evaluation, draw_seeds, side_generator
 from ..target.sampled_model import SampledModel
-from .warnings import sampler_warning
 
 # The variances between which a chain gains most per unit of time, and their geometric mean.
 TARGET = (1.0, 3.3)
@@ -40,10 +36,6 @@ MIDDLE = math.sqrt(TARGET[0] * TARGET[1])
 TOO_NOISY, TOO_QUIET = 10.0, 0.05
 # Below this the estimate is exact, as that of a guided filter on a linear system.
 ROUNDING = 1e-12
-# Above this factor of particles the variance is extrapolated too far to name it.
-MOST = 1000.0
-# Fewer particles are worth asking for if an evaluation takes half of the time with them.
-WORTHWHILE = 2.0
 
 # Two-sided probability of the intervals.
 _CONFIDENCE = 0.95
@@ -119,74 +111,10 @@ def acceptance_share(variance: float) -> float:
     return math.erfc(0.5 * math.sqrt(variance))
 
 
-def variance_advice(
-    spread: SeedSpread,
-    where: str,
-    chain: int,
-    filters: Sequence[EnsembleFilter] = (),
-    remedy: str = "",
-) -> str | None:
-    """Advise the user if the variance is far outside the range in which chains work best.
-
-    None between variances of 0.05 and 10, without noise, and where fewer particles would save
-    little. ``where`` says where it was measured, such as "at the start"; ``filters`` are the noisy
-    ones, and ``remedy`` is what to do if their particles collapse.
-    """
-    found = f"Chain {chain}, {where}: the estimated log-likelihood{spread.of}"
-    if spread.n_failed > spread.n or spread.variance == np.inf:
-        return (
-            f"{found} failed for {spread.n_failed} of {spread.n + spread.n_failed} noise seeds. "
-            "Start elsewhere (initvals), or give the filter more particles."
-        )
-    if spread.variance > TOO_NOISY:
-        share, more = acceptance_share(spread.variance), more_particles(spread.variance, remedy)
-        return (
-            f"{found} has a variance of {spread.variance:.3g} over {spread.n} noise seeds. "
-            f"The chain accepts about {share:.1g} of the moves that it would accept with an exact "
-            f"likelihood, and stays long at overestimates. {more}"
-        )
-    if not ROUNDING < spread.variance < TOO_QUIET:
-        return None
-    factor, saved = speed_up(filters, MIDDLE / spread.variance)
-    if saved < WORTHWHILE:
-        return None
-    return (
-        f"{found} has a variance of only {spread.variance:.2g} over {spread.n} noise seeds. "
-        f"With about {rounded(factor)} times fewer particles it would lie below {TARGET[1]:g} and "
-        "the chain would gain more per unit of time; psf.suggest_particles(model) finds the number."
-    )
-
-
-def more_particles(variance: float, remedy: str) -> str:
-    """Say what brings a variance into the range: so many particles, or something else."""
-    factor = variance / MIDDLE
-    if factor > MOST:
-        return f"More particles would hardly do. {remedy}".rstrip()
-    return (
-        f"The variance is about proportional to 1/N for N particles: {rounded(factor)} times as "
-        f"many would bring it between {TARGET[0]:g} and {TARGET[1]:g}; "
-        "psf.suggest_particles(model) finds the number."
-    )
-
-
 def is_measured(target: SampledModel, n_iterations: int) -> bool:
     """Whether a run measures the variance: with fresh noise, and unless it is short."""
     noisy = target.seed_names and target.settings.refresh_noise
     return bool(noisy) and n_iterations >= LEAST_ITERATIONS
-
-
-def start_warning(spread: SeedSpread, chain: int, remedy: str = "") -> SamplerWarning | None:
-    """Warn that the noise at a start is such that a chain may never leave it."""
-    if not HOPELESS < spread.variance < np.inf:
-        return None
-    return sampler_warning(
-        f"Chain {chain}, at the start: the estimated log-likelihood{spread.of} has a variance of "
-        f"{spread.variance:.3g} over {spread.n} noise seeds. The chain accepts about "
-        f"{acceptance_share(spread.variance):.1g} of the moves that it would accept with an exact "
-        "likelihood: it has not left the start yet and may never do so. Start elsewhere "
-        "(initvals), or give the filter more particles; psf.suggest_particles(model) finds the "
-        f"number. {remedy if spread.variance > MOST * MIDDLE else ''}".rstrip()
-    )
 
 
 def spread_at_highest_draw(
@@ -194,25 +122,15 @@ def spread_at_highest_draw(
     tune: int,
     measure: Callable[[np.ndarray, np.ndarray], SeedSpread],
     keys: Sequence[np.ndarray],
-    target: SampledModel,
-) -> tuple[SeedSpread, SamplerWarning | None]:
-    """Measure the variance at the draw of highest density of all chains, after the warm-up.
+    n_seeds: int,
+) -> tuple[int, SeedSpread]:
+    """Measure the variance at the draw of highest density after the warm-up, and name its chain.
 
-    The estimate there is an overestimate, but the point is typical of the centre. The warning is
-    given if the variance is far outside the range in which chains work best.
+    The estimate there is an overestimate, but the point is typical of the centre.
     """
     densities = [of_chain.numbers[tune:, LOG_DENSITY] for of_chain in draws]
     chain = int(np.argmax([of_chain.max() for of_chain in densities]))
     row = tune + int(densities[chain].argmax())
     # From the chain's key, which a checkpoint stores: a resumed run measures the same.
-    seeds = draw_seeds(side_generator(keys[chain]), (N_SEEDS, len(target.seed_names)))
-    spread = measure(draws[chain].positions[row], seeds)
-    filters, remedy = target.noisy_filters, target.collapse_remedy
-    message = variance_advice(spread, "at its highest draw", chain, filters, remedy)
-    return spread, None if message is None else sampler_warning(message)
-
-
-def rounded(factor: float) -> str:
-    """Format a factor with two digits, without an exponent."""
-    digits = 1 - math.floor(math.log10(factor))
-    return f"{round(factor, digits):.{max(0, digits)}f}"
+    seeds = draw_seeds(side_generator(keys[chain]), (N_SEEDS, n_seeds))
+    return chain, measure(draws[chain].positions[row], seeds)

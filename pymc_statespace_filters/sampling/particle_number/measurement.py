@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...filters.protocol import Filter
-from ...filters.recommendation import short_form
+from ...filters.written import short_form
 from ...pymc_model.inspection import resized
 from .effort import Effort, OutOfTimeError
 from .noisy_likelihood import Estimates, NoisyLikelihood

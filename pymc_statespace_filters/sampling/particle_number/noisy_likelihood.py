@@ -15,11 +15,11 @@ from ...pymc_model.graph_rewrites import likelihood_terms, with_filter
 from ...pymc_model.inspection import (
     noise_seeds,
     noisy_filters,
-    quieter_filter,
     resized,
     state_space_nodes,
 )
 from ...pymc_model.panel_structure import panel_structure
+from ...pymc_model.quieter_filter import quieter_filter
 from ..kernel.state import draw_seeds
 from ..output.likelihood_variance import TOO_NOISY, SeedSpread, spread_of
 from ..target.target import Target

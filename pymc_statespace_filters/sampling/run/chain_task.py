@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 from threading import Event
 
 import numpy as np
-from pymc.stats.convergence import SamplerWarning, log_warnings
 
+from ...facts import tell
 from ..checkpoint.checkpoint import Checkpoint
 from ..kernel.state import (
     N_DONE,
@@ -24,7 +24,8 @@ from ..kernel.state import (
     draw_seeds,
     n_accepted,
 )
-from ..output.likelihood_variance import N_SEEDS, N_STUCK, start_warning
+from ..output.facts import NoisyStart
+from ..output.likelihood_variance import N_SEEDS, N_STUCK
 from ..target.record_target import RecordTarget
 from ..target.target import Target
 from .chain_arrays import StopRequested
@@ -117,7 +118,7 @@ class ChainTask:
         self._is_resumed = self.n_done > 0
         self._saved_at = time.monotonic()
         self.seconds = 0.0  # duration of a finished chain; 0 if it was resumed from a checkpoint
-        self._start_warning: SamplerWarning | None = None
+        self._noisy_start: NoisyStart | None = None
 
     @property
     def n_done(self) -> int:
@@ -203,15 +204,15 @@ class ChainTask:
             state = self.chain.state
             seeds = draw_seeds(self._rng, (N_SEEDS, self._n_noisy))
             spread = self.chain.seed_spread(state.position, seeds)
-            self._start_warning = start_warning(spread, self._index, self._target.collapse_remedy)
+            self._noisy_start = NoisyStart(self._target.model, self._index, spread)
         return failures
 
     def _warn_if_stuck(self) -> None:
         """Log that the start is too noisy, unless the chain has left it, as most do."""
-        if self._start_warning is not None and self.n_done >= N_STUCK:
+        if self._noisy_start is not None and self.n_done >= N_STUCK:
             if not self.chain.draws.counts[:N_STUCK, STAGE].any():
-                log_warnings([self._start_warning])
-            self._start_warning = None
+                tell(self._noisy_start)
+            self._noisy_start = None
 
     def _advance(self) -> None:
         """Advance to the end of the block of random numbers, or of the phase."""

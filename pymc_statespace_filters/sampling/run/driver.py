@@ -19,17 +19,17 @@ from contextlib import ExitStack
 from functools import partial
 
 from pymc.model import Model
-from pymc.stats.convergence import log_warnings
 from xarray import DataTree
 
 from ...compiler.native.compilation import COMPILATION
 from ...errors import ModelError
+from ...facts import tell
 from ...parallel.agreement import check_same_call
 from ...parallel.communicator import Communicator, communicator_of
 from ...parallel.cpu_affinity import allowed_cores, cores_per_process
 from ...parallel.signals import keeps_what_is_there
 from ..checkpoint.checkpoint import join_checkpoint, open_checkpoint
-from ..output.report import no_draws_warning
+from ..output.facts import WithoutDraws
 from ..target.leader_follower import follow, release_followers
 from .model_task import ModelTask
 from .request import ExecutionOptions, SamplingRequest
@@ -117,7 +117,9 @@ def _run(
         if not kept and not all(task.is_complete for task in tasks):
             raise KeyboardInterrupt("the run was interrupted before there was a draw to return")
         kept = kept or list(tasks)
-        log_warnings([no_draws_warning(task.name) for task in tasks if task not in kept])
+        for task in tasks:
+            if task not in kept:
+                tell(WithoutDraws(task.name))
         with COMPILATION:
             return {
                 task.name: task.to_datatree(check_convergence=check, report_level=level)

@@ -13,8 +13,8 @@ from ...parallel.signals import unless_interrupted
 from ..checkpoint.checkpoint import Checkpoint
 from ..kernel.state import ChainState, Draws
 from ..output.convergence import Convergence, convergence
+from ..output.facts import of_model
 from ..output.likelihood_variance import is_measured
-from ..output.warnings import of_model
 from ..target.initial_points import chain_candidates
 from ..target.record_target import RecordTarget, target_of
 from ..target.target import Target
@@ -156,7 +156,7 @@ class ModelTask:
             target,
             self.request,
             self.checkpoint,
-            self._said,
+            of_model(self.name),
             progressbar=progressbar,
         )
 
@@ -309,10 +309,6 @@ class ModelTask:
             level=self._level,
             is_noisy=self._is_noisy,
             convergence=found,
-            said=self._said,
+            begin=of_model(self.name),
         )
         return result.to_datatree(check_convergence=check_convergence, report_level=report_level)
-
-    def _said(self, message: str) -> str:
-        """A message about this model, with its name if there are several."""
-        return of_model(self.name) + message

@@ -1,26 +1,24 @@
 """The search for starts of a model's chains, and the mixture of proposals that they share."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from pymc.model import Model
-from pymc.stats.convergence import log_warnings
 
 from ...errors import ModelError
+from ...facts import tell
 from ...student_mixture import standardised
 from ..checkpoint.checkpoint import Checkpoint
 from ..kernel.independence import no_mixture
 from ..kernel.proposal_mixture import fitted_mixture, improved_mixture, warmup_parts
 from ..kernel.state import Draws
+from ..output.facts import NoisyStarts, SeparateModes
 from ..output.likelihood_variance import is_measured
 from ..starts.annealing import N_SWEEPS
 from ..starts.local_scale import local_cov
-from ..starts.modes import modes_message, modes_warning
 from ..starts.population import N_POINTS, find_population
 from ..target.target import MANY_DIMENSIONS, Target
-from .noise_at_starts import noise_warning
 from .request import SamplingRequest
 
 _NO_CHAIN = 2**32 - 1
@@ -119,14 +117,14 @@ def search_population(
     target: Target,
     request: SamplingRequest,
     checkpoint: Checkpoint | None,
-    said: Callable[[str], str],
+    begin: str,
     *,
     progressbar: bool,
 ) -> SearchedPoints | None:
     """Points of the posterior, stored in the checkpoint; None if starts are given otherwise.
 
     None with a short warm-up of an expensive filter, too, and if the noise is carried. A pilot
-    that lacks no variable has the points itself. ``said`` adds the model's name to a message.
+    that lacks no variable has the points itself. ``begin`` is the beginning of messages.
 
     Raises
     ------
@@ -144,7 +142,7 @@ def search_population(
         or target.carries_noise
     ):
         if pilot is not None:
-            raise ModelError(said(_UNUSABLE_PILOT))
+            raise ModelError(begin + _UNUSABLE_PILOT)
         return None
     journal = None if checkpoint is None else checkpoint.journal("starts")
     if journal is not None and (stored := journal.read()) is not None:
@@ -158,17 +156,15 @@ def search_population(
             pilot=pilot,
         )
     except Exception as error:
-        error.add_note(said("in the search for starts"))
+        error.add_note(begin + "in the search for starts")
         raise
-    if (message := modes_message(model, target.raveled, found)) is not None:
-        log_warnings([modes_warning(said(message))])
-    level, noise = float(np.median(found.log_density)), None
+    tell(SeparateModes(model, target.raveled, found), begin)
+    level, noise = float(np.median(found.log_density)), []
     if journal is not None:
         journal.append({"population": found.x}, {"level": np.array(level)})
     if is_measured(target, request.n_iterations):
-        noise = noise_warning(model, target, found, generator_of(request, 0, 1))
-        log_warnings([] if noise is None else [replace(noise, message=said(noise.message))])
-    return SearchedPoints(found.x, level, noise is not None)
+        noise = tell(NoisyStarts(model, target, found, generator_of(request, 0, 1)), begin)
+    return SearchedPoints(found.x, level, bool(noise))
 
 
 def n_search_points(request: SamplingRequest, target: Target) -> int:

@@ -1,14 +1,11 @@
 """When the chains of a model end: after a number of draws, or when these are worth enough."""
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 from ...errors import ModelError
 from ...system.checks import check_count, check_positive
 from ..output.convergence import FEWEST, MAX_RHAT, Convergence
-from ..output.remedies import alternatives
-from ..output.report import needed
 from .request import SamplingRequest
 
 AUTO = "auto"
@@ -89,26 +86,3 @@ def next_length(
         return longer if is_short and 2.0 * seconds <= request.seconds else None
     draws = min(request.max_draws, length.draws + math.ceil(length.draws / 2))
     return length._replace(draws=draws) if draws > length.draws else None
-
-
-def remedy_of(
-    request: SamplingRequest,
-    length: Length,
-    found: Convergence | None,
-    seconds: float,
-    ways: Sequence[str],
-) -> str:
-    """What to do if chains ended before their draws were worth enough; ``ways`` make them mix."""
-    enough = request.until_ess or 0.0
-    if not shows(request, enough):
-        return f"give more draws: {request.chains} * {request.draws} hardly show so many"
-    would_do = "" if found is None else f"{needed(found, enough, length.n_iterations, seconds)}; "
-    if not request.doubles_thin:
-        return would_do + alternatives(["give a larger max_draws", *ways])
-    if 2 * length.n_iterations > (request.max_draws or 0):
-        return would_do + alternatives([f"give a larger max_draws than {request.max_draws}", *ways])
-    more = alternatives(["make more with psf.sample(continue_from=idata)", *ways])
-    return (
-        f"{would_do}the run ended as twice as many would take longer than its "
-        f"{request.seconds:.0f} s: {more}"
-    )

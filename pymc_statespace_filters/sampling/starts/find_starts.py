@@ -2,13 +2,13 @@
 
 import numpy as np
 from pymc.model import Model
-from pymc.stats.convergence import log_warnings
 
 from ...errors import ModelError
+from ...facts import tell
 from ...pymc_model.density import ConstrainedValues
 from ...pymc_model.inspection import given_model
 from ...system.checks import check_count, check_flag, check_random_seed
-from .modes import modes_message, modes_warning
+from ..output.facts import SeparateModes
 from .population import N_POINTS, population_of
 
 
@@ -87,8 +87,7 @@ def find_starts(
         raise ModelError(f"chains must be at most {N_POINTS}, got {chains}")
     rng = check_random_seed(random_seed)
     found, raveled = population_of(model, rng, progressbar=progressbar)
-    if (message := modes_message(model, raveled, found)) is not None:
-        log_warnings([modes_warning(message)])
+    tell(SeparateModes(model, raveled, found))
     chosen = rng.choice(len(found.x), chains, replace=chains > len(found.x))
     values = ConstrainedValues(model)
     return [values(x) for x in found.x[chosen]]

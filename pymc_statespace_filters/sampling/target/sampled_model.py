@@ -11,7 +11,6 @@ from pytensor.tensor.variable import TensorVariable
 from ...errors import ModelError
 from ...pymc_model.inspection import (
     check_observed,
-    collapse_remedies,
     exactness,
     noise_seeds,
     noisy_filters,
@@ -72,11 +71,6 @@ class SampledModel:
         if not self.raveled.dim:
             raise ModelError("model must have at least one free variable to sample, got none")
         self.prior_draws = PriorDraws(model, self.raveled, self._default)
-
-    @cached_property
-    def collapse_remedy(self) -> str:
-        """What to do where particles collapse, for every filter of the model that has some."""
-        return collapse_remedies(self.model)
 
     @cached_property
     def noisy_filters(self) -> list[Any]:

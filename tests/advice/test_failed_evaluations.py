@@ -7,8 +7,8 @@ import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.evaluation import filter_warnings
-from pymc_statespace_filters.evaluation.filter_warnings import warn_about
+from pymc_statespace_filters.advice import health
+from pymc_statespace_filters.evaluation.health import tell_of_health
 from pymc_statespace_filters.filters.outcomes import COLLAPSED, Failure
 
 # Health that does not come from a filter: smallest effective number, failure, observation.
@@ -39,7 +39,7 @@ def warned(rows, filter="a filter", system=SYSTEM):
     asked = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        warn_about(system, filter, np.array(rows), lambda i: asked.append(i) or RECORD)
+        tell_of_health(system, filter, np.array(rows), lambda i: asked.append(i) or RECORD)
     return [str(w.message) for w in caught], asked
 
 
@@ -56,7 +56,7 @@ def test_the_worst_evaluation_is_the_one_with_the_fewest_that_did_not_fail():
 
 
 def test_a_filter_is_not_its_own_remedy(monkeypatch):
-    monkeypatch.setattr(filter_warnings, "_extent", lambda *_: "Some terms")
+    monkeypatch.setattr(health, "_extent", lambda *_: "Some terms")
     (of_guided,), _ = warned([[1.5, 0.0, -1.0]], psf.GuidedPF(100), BENT)
     (of_bootstrap,), _ = warned([[1.5, 0.0, -1.0]], psf.BootstrapPF(100), BENT)
     (of_linear,), _ = warned([[1.5, 0.0, -1.0]], psf.BootstrapPF(100))

@@ -7,16 +7,14 @@ compiled only where steps half as long are others.
 import numpy as np
 from numpy.typing import NDArray
 from pymc.model import Model
-from pymc.stats.convergence import SamplerWarning
 from scipy.special import softmax
 from xarray import DataTree
 
-from ...errors import ModelError
-from ...pymc_model.density import RowFunction
-from ...pymc_model.inspection import noisy_filters
-from ...pymc_model.posterior_draws import unconstrained_draws
-from ...pymc_model.step_refinement import densities_by_halvings, step_accuracy, step_lengths
-from .warnings import sampler_warning
+from ..errors import ModelError
+from ..pymc_model.density import RowFunction
+from ..pymc_model.inspection import noisy_filters
+from ..pymc_model.posterior_draws import unconstrained_draws
+from ..pymc_model.step_refinement import densities_by_halvings, step_accuracy, step_lengths
 
 _N_POINTS, _N_DRAWS = 10, 200
 # Of the factors by which one step and two half as long multiply a deviation: that of Euler-Maruyama
@@ -30,8 +28,8 @@ _ROUNDING = 1e-12  # of the mean, for the standard deviation of draws that are a
 Array = NDArray[np.float64]
 
 
-def step_warnings(tree: DataTree, model: Model) -> list[SamplerWarning]:
-    """Warn of integration steps that are too long for the equations at the draws."""
+def step_problems(tree: DataTree, model: Model) -> list[str]:
+    """Say which integration steps are that are too long for the equations at the draws."""
     accuracy = step_accuracy(model)
     if accuracy is None:
         return []
@@ -50,11 +48,9 @@ def step_warnings(tree: DataTree, model: Model) -> list[SamplerWarning]:
     else:
         return []
     return [
-        sampler_warning(
-            f"The integration steps of {max(step_lengths(model)):g} are too long for the equations "
-            f"here: {found}. Take four times as many substeps, or an integrator of higher order, "
-            "until this is no longer said; psf.step_error measures what is left."
-        )
+        f"The integration steps of {max(step_lengths(model)):g} are too long for the equations "
+        f"here: {found}. Take four times as many substeps, or an integrator of higher order, "
+        "until this is no longer said; psf.step_error measures what is left."
     ]
 
 

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from pymc.model import Model
 from pytensor.graph.traversal import ancestors
 
-from ...pymc_model.elements import Elements
-from ...pymc_model.inspection import state_space_nodes
+from ..pymc_model.elements import Elements
+from ..pymc_model.inspection import state_space_nodes
 
 _LEAST_SHARE = 0.02  # of the draws, with the rarer sign
 _N_POINTS = 8

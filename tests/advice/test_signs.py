@@ -5,7 +5,7 @@ import pymc as pm
 import pytensor.tensor as pt
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.sampling.output.signs import signs_message
+from pymc_statespace_filters.advice.signs import signs_message
 from tests.modes import AS_IT_STANDS
 
 DRAWS = np.random.default_rng(1).normal(size=(400, 3))

@@ -1,15 +1,15 @@
-"""The search for what chains have missed, at the end of their run, in a small part of its time."""
+"""What chains have missed of the posterior: a search at their end, in a small part of its time."""
 
 import numpy as np
-from pymc.model import Model
-from pymc.stats.convergence import SamplerWarning
-from xarray import DataTree
 
-from ...pymc_model.density import ModelDensity
-from ...pymc_model.posterior_draws import noise_was_moved, unconstrained_draws
-from ..target.initial_points import PriorDraws
+from ..parallel.signals import unless_interrupted
+from ..pymc_model.density import ModelDensity
+from ..pymc_model.posterior_draws import noise_was_moved, unconstrained_draws
+from ..sampling.output.facts import EndedRun
+from ..unvisited.check import MOST_PARAMETERS
+from ..unvisited.sentences import store, unvisited
 from .signs import signs_message
-from .warnings import sampler_warning
+from .step_check import step_problems
 
 # CPU seconds: so many, or this share of the time of the run if that is more.
 _LEAST_SECONDS, _SHARE = 1.0, 0.1
@@ -17,17 +17,21 @@ _LEAST_SECONDS, _SHARE = 1.0, 0.1
 _LEAST_DRAWS = 4000
 
 
-def unvisited_warnings(
-    tree: DataTree, model: Model, prior: PriorDraws, seconds: float, rng: np.random.Generator
-) -> list[SamplerWarning]:
-    """Warn of modes and tails of the posterior that the chains of a run of so many seconds lack.
+def missed_of(fact: EndedRun) -> list[str]:
+    """Say what the draws lack, and whether their integration steps are too long."""
+    nothing: list[str] = []
+    return [
+        *unless_interrupted(lambda: _missed_parts(fact), nothing),
+        *unless_interrupted(lambda: step_problems(fact.tree, fact.model), nothing),
+    ]
+
+
+def _missed_parts(fact: EndedRun) -> list[str]:
+    """Say which modes and tails of the posterior the draws lack, or that a sign has no meaning.
 
     The outcome is stored with the draws. Chains that held one noise seed are not checked.
     """
-    # They load SciPy's statistics, which would take a third of the time to import a sampler.
-    from ...unvisited.check import MOST_PARAMETERS
-    from ...unvisited.sentences import store, unvisited
-
+    tree, model, prior = fact.tree, fact.model, fact.target.prior_draws
     posterior = tree["posterior"]
     if posterior.sizes["chain"] * posterior.sizes["draw"] < _LEAST_DRAWS:
         return []
@@ -45,12 +49,12 @@ def unvisited_warnings(
         return density.evaluate(x, rng.integers(np.iinfo(np.int64).max, size=size))
 
     log_density = stats["lp"].transpose("chain", "draw").values.astype(np.float64)
-    seconds = max(_LEAST_SECONDS, _SHARE * seconds)
+    seconds = max(_LEAST_SECONDS, _SHARE * fact.seconds)
     wide = prior.draws if prior.is_prior and len(prior.draws) > 1 else None
-    found = unvisited(model, draws, log_density, evaluate, seconds, rng, wide)
+    found = unvisited(model, draws, log_density, evaluate, seconds, fact.rngs[0], wide)
     store(tree, found)
     if not density.seed_names:
         flat = draws.reshape(-1, draws.shape[-1])
-        sign = signs_message(model, flat, lambda x: evaluate(x, rng))
+        sign = signs_message(model, flat, lambda x: evaluate(x, fact.rngs[0]))
         found = found if sign is None else [sign, *found]
-    return [sampler_warning(f"{text[0].upper()}{text[1:]}.") for text in found]
+    return [f"{text[0].upper()}{text[1:]}." for text in found]

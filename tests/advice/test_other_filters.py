@@ -8,16 +8,12 @@ import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.advice.choice import jump_problem
+from pymc_statespace_filters.advice.collapse import collapse_remedies, collapse_remedy
+from pymc_statespace_filters.advice.refusals import alternatives
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.filters.recommendation import (
-    alternatives,
-    collapse_remedy,
-    filters_for,
-    jump_problem,
-    quiet_filter,
-    short_form,
-)
-from pymc_statespace_filters.pymc_model.inspection import collapse_remedies
+from pymc_statespace_filters.filters.catalog import filters_for, quiet_filter
+from pymc_statespace_filters.filters.written import short_form
 
 PARTICLES = {"GuidedPF", "BootstrapPF", "PFEnKF"}
 GAUSSIAN = {"EKF", "UKF", "IPLF"}

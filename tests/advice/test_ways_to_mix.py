@@ -1,17 +1,19 @@
 """What chains that mix slowly are told to do."""
 
+from types import SimpleNamespace
+
 import arviz as az
 import numpy as np
 import pymc as pm
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.sampling.output.convergence import Convergence
-from pymc_statespace_filters.sampling.output.remedies import (
+from pymc_statespace_filters.advice.mixing import mixing_problem
+from pymc_statespace_filters.advice.remedies import (
     alternatives,
     reaches_zero,
     ways_to_mix,
 )
-from pymc_statespace_filters.sampling.output.report import mixing_warning
+from pymc_statespace_filters.sampling.output.convergence import Convergence
 from pymc_statespace_filters.unvisited import ALL_MODES
 
 RNG = np.random.default_rng(0)
@@ -58,8 +60,11 @@ def test_the_advice():
     (way,) = ways_to_mix(model, names, positions, "other")
     assert way.startswith("sample stiffness as it is, whose logarithm")
     found = Convergence(np.array([900.0]), np.array([900.0]), np.array([1.02]))
-    warning = mixing_warning(found, ["stiffness"], 400.0, 1000, 1.0, lambda name: [way])
-    assert warning.message.endswith(f"(stiffness). If R-hat stays above 1.01, {way}.")
+    request = SimpleNamespace(chains=4, draws=1000, doubles_thin=False)
+    ended = SimpleNamespace(request=request, convergence=found, names=["stiffness"])
+    assert mixing_problem(ended, lambda name: [way]).endswith(
+        f"(stiffness). If R-hat stays above 1.01, {way}."
+    )
     model, names, positions = drawn(5 + NORMAL)
     assert alternatives(ways_to_mix(model, names, positions, "other")) == (
         "tune longer, use psf.sample(sampler='nuts'), or reparametrise other"

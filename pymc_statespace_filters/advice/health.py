@@ -1,24 +1,15 @@
-"""Warnings of filters: failed, decided by too few particles, or chosen against the equations."""
+"""Evaluations that failed, or that few particles decided: where, how far off, what helps."""
 
-import warnings
-from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from ..compiler.lowering.compiled_system import compile_system
-from ..errors import INSIDE, FilterWarning
+from ..evaluation.health import Arguments, Health
+from ..filters.catalog import exact_filter
 from ..filters.outcomes import COLLAPSED, Failure
 from ..filters.protocol import HealthFilter
-from ..filters.recommendation import (
-    collapse_remedy,
-    elsewhere,
-    exact_filter,
-    jump_problem,
-    repetition_problem,
-    rounding_problem,
-    short_form,
-)
+from ..filters.written import short_form
 from ..ops.base import evaluator
 from ..ops.likelihood import LogLikelihood
 from ..ops.states import TermHealth
@@ -26,57 +17,52 @@ from ..system.input_columns import times_of_steps
 from ..system.model import StateSpaceModel
 from ..system.parameters import element_names
 from ..system.readers import counts
-
-type Arguments = tuple[Any, ...]
+from .collapse import collapse_remedy, elsewhere
+from .words import sentences
 
 _MOST_LISTED = 8  # observations, or records
 _NEGLIGIBLE = 0.01  # nats
 _N_SEEDS = 5  # at which a collapsed estimate is repeated, to say how noisy it is
 
 
-def warn_about(
-    system: StateSpaceModel,
-    filter: Any,
-    health: np.ndarray,
-    arguments_of: Callable[[int], Arguments],
-    *,
-    labels: Sequence[Any] | None = None,
-) -> None:
-    """Warn once of failures and once of collapse in some evaluations, given their health (n, 3).
+@sentences.register
+def _(fact: Health) -> list[str]:
+    """One sentence for each kind of failure, and one of collapse."""
+    found = [_failure(fact, code) for code in np.unique(fact.health[fact.failed, 1])]
+    collapse = _collapse(fact)
+    return found if collapse is None else [*found, collapse]
 
-    ``arguments_of(i)`` are the inputs (theta, steps, observed, inputs, t0, seed) of evaluation i,
-    which is repeated if its particles were the fewest. ``labels`` are those of the records of a
-    panel; the evaluations of one come before those of the next, and are as many.
-    """
-    failed = health[:, 1] != 0
-    of_each = None if labels is None else np.arange(len(health)) // (len(health) // len(labels))
-    for code in np.unique(health[failed, 1]):
-        failure, here = Failure.of(code), health[:, 1] == code
-        first = int(np.argmax(here))
-        share = f" in {here.sum()} of {len(health)} evaluations" if len(health) > 1 else ""
-        arguments = arguments_of(first)
-        place = _place(system, failure, health[first, 2], arguments, bool(share))
-        of_records = _named(labels, of_each, here)
-        sentences = (
-            f"{short_form(filter)} gave -inf{share}{of_records}{place}: {failure.message}",
-            *_cures(system, filter, failure, arguments, health[first, 2]),
-        )
-        warnings.warn(f"{'. '.join(sentences)}.", FilterWarning, skip_file_prefixes=INSIDE)
-    smallest = np.where(failed, np.inf, health[:, 0])
-    collapsed = smallest < COLLAPSED
-    worst = int(np.argmin(smallest))
-    extent = _extent(system, filter, arguments_of(worst)) if collapsed.any() else None
-    if extent is not None:
-        sentences = (
-            f"{short_form(filter)}: fewer than {COLLAPSED:g} particles decided some terms of the "
-            f"log-likelihood in {collapsed.sum()} of {len(health)} evaluations"
-            f"{_named(labels, of_each, collapsed)} (smallest effective number "
-            f"{smallest[worst]:.3g})",
-            *_about_copies(system, filter),
-            extent,
-            collapse_remedy(compile_system(system), filter),
-        )
-        warnings.warn(". ".join(sentences), FilterWarning, skip_file_prefixes=INSIDE)
+
+def _failure(fact: Health, code: float) -> str:
+    system, filter, health = fact.system, fact.filter, fact.health
+    failure, here = Failure.of(code), health[:, 1] == code
+    first = int(np.argmax(here))
+    share = f" in {here.sum()} of {len(health)} evaluations" if len(health) > 1 else ""
+    arguments = fact.arguments_of(first)
+    place = _place(system, failure, health[first, 2], arguments, bool(share))
+    sentences = (
+        f"{short_form(filter)} gave -inf{share}{_named(fact, here)}{place}: {failure.message}",
+        *_cures(system, filter, failure, arguments, health[first, 2]),
+    )
+    return f"{'. '.join(sentences)}."
+
+
+def _collapse(fact: Health) -> str | None:
+    """Say which evaluations few particles decided; the one with fewest is repeated for it."""
+    system, filter, smallest = fact.system, fact.filter, fact.smallest
+    collapsed, worst = smallest < COLLAPSED, int(np.argmin(smallest))
+    extent = _extent(system, filter, fact.arguments_of(worst)) if collapsed.any() else None
+    if extent is None:
+        return None
+    sentences = (
+        f"{short_form(filter)}: fewer than {COLLAPSED:g} particles decided some terms of the "
+        f"log-likelihood in {collapsed.sum()} of {len(smallest)} evaluations"
+        f"{_named(fact, collapsed)} (smallest effective number {smallest[worst]:.3g})",
+        *_about_copies(system, filter),
+        extent,
+        collapse_remedy(compile_system(system), filter),
+    )
+    return ". ".join(sentences)
 
 
 def _about_copies(system: StateSpaceModel, filter: Any) -> list[str]:
@@ -152,21 +138,14 @@ def _terms(system: StateSpaceModel, filter: Any, arguments: Arguments) -> np.nda
     return np.asarray(evaluator(LogLikelihood(system, filter))(*arguments)[0])
 
 
-def _named(labels: Sequence[Any] | None, of_each: Any, chosen: np.ndarray) -> str:
+def _named(fact: Health, chosen: np.ndarray) -> str:
     """The records of the chosen evaluations."""
-    if labels is None:
+    if fact.labels is None:
         return ""
-    found = [labels[number] for number in np.unique(of_each[chosen])]
+    of_each = np.arange(len(fact.health)) // (len(fact.health) // len(fact.labels))
+    found = [fact.labels[number] for number in np.unique(of_each[chosen])]
     listed = ", ".join(map(repr, found[:_MOST_LISTED])) + ", .." * (len(found) > _MOST_LISTED)
     return f", of {'record' if len(found) == 1 else 'records'} {listed}"
-
-
-def warn_of_choice(system: StateSpaceModel, filter: Any) -> None:
-    """Warn if the filter linearises what jumps, repeats a run without noise, or has no digits."""
-    compiled = compile_system(system)
-    for problem_of in (jump_problem, repetition_problem, rounding_problem):
-        if (problem := problem_of(compiled, filter)) is not None:
-            warnings.warn(problem, FilterWarning, skip_file_prefixes=INSIDE)
 
 
 def _extent(system: StateSpaceModel, filter: Any, arguments: Arguments) -> str | None:

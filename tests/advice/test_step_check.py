@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.sampling.output.step_check import step_warnings
+from pymc_statespace_filters.advice.step_check import step_problems
 
 
 def decay(dt, integrator=psf.EulerMaruyama, **options):
@@ -53,4 +53,4 @@ def test_draws_that_do_not_vary_tell_nothing(record):
         pm.HalfNormal("s", 4.0)
         observed = record["observations"]
         psf.StateSpace("d", decay(0.5), psf.EKF(), steps=range(1, 101), observed=observed)
-    assert step_warnings(xr.DataTree.from_dict({"posterior": stuck}), model) == []
+    assert step_problems(xr.DataTree.from_dict({"posterior": stuck}), model) == []

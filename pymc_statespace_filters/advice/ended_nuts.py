@@ -1,0 +1,101 @@
+"""What is said at the end of a run of NUTS: each cause once, and the report."""
+
+import numpy as np
+
+from ..filter_checks.facts import UsedFilters
+from ..parallel.signals import is_interrupted
+from ..sampling.nuts.chains import TOLERATED
+from ..sampling.output.convergence import MAX_RHAT
+from ..sampling.output.facts import EndedNuts
+from .filter_check import check_filters
+from .missed import missed_of
+from .mixing import until_ess_problem
+from .remedies import alternatives, reaches_zero, without_transform
+from .words import log, tell
+
+# Bayesian fraction of missing information of the energies, below which the tails of one are too
+# long for its momenta (Betancourt 2016).
+_LEAST_E_BFMI = 0.3
+
+
+@tell.register
+def _(fact: EndedNuts, begin: str = "") -> list[str]:
+    missed = missed_of(fact)
+    n_iterations = fact.request.tune + fact.length.n_iterations
+    check = check_filters(
+        UsedFilters(
+            fact.tree, fact.model, n_iterations, fact.seconds, fact.rngs[1], None, fact.level
+        )
+    )
+    bounded = reaches_zero(fact.model, fact.names, fact.positions)
+    instead = "" if bounded is None else without_transform(bounded)
+    said = [*_problems(fact, instead), *missed, *_too_short(fact, instead)]
+    report = _report(fact)
+    is_good = fact.convergence is not None and fact.convergence.rhat.max() <= MAX_RHAT
+    if is_good and not said and not is_interrupted():
+        report += " No problems found."
+    log([begin + text for text in said])
+    log([begin + report], fact.level)
+    check.tell(fact.level, begin)
+    return [*said, *check.warned]
+
+
+def _too_short(fact: EndedNuts, instead: str) -> list[str]:
+    """Draws that are worth less than was asked for."""
+
+    def ways(slowest: str) -> list[str]:
+        return [instead] if instead else ["use sampler='dram'", f"reparametrise {slowest}"]
+
+    remedy = ""
+    if fact.is_stuck:
+        slowest = fact.names[0 if fact.convergence is None else int(fact.convergence.rhat.argmax())]
+        remedy = f"more iterations do not help draws that diverge: {alternatives(ways(slowest))}"
+    text = until_ess_problem(fact, ways, remedy)
+    return [] if text is None else [text]
+
+
+def _report(fact: EndedNuts) -> str:
+    n_chains, n_draws = fact.diverging.shape
+    behind = "" if fact.length.thin == 1 else f", each the last of {fact.length.thin}"
+    found = "" if fact.convergence is None else f"; {fact.convergence.described(fact.names)}"
+    return (
+        f"{n_chains} chains of {n_draws} draws{behind}, after a warm-up of {fact.request.tune}"
+        f"{found}. A draw took {fact.n_steps.mean():.0f} gradients; E-BFMI is at least "
+        f"{_e_bfmi(fact).min():.2f}."
+    )
+
+
+def _problems(fact: EndedNuts, instead: str) -> list[str]:
+    diverging, e_bfmi = fact.diverging, _e_bfmi(fact)
+    if diverging.mean() > TOLERATED:
+        return [
+            f"{int(diverging.sum())} of {diverging.size} draws diverged, most where "
+            f"{_neck(fact)}: "
+            f"{instead or "reparametrise that variable, or use sampler='dram'"}."
+        ]
+    if e_bfmi.min() < _LEAST_E_BFMI:
+        return [
+            f"E-BFMI is {e_bfmi.min():.2f} in chain {int(e_bfmi.argmin())}: the chains are slow "
+            f"along the log-density, as of {_neck(fact)}; reparametrise it, or use "
+            "sampler='dram'."
+        ]
+    return []
+
+
+def _e_bfmi(fact: EndedNuts) -> np.ndarray:
+    """E-BFMI of each chain."""
+    energy = fact.energy
+    return np.asarray(np.square(np.diff(energy, axis=1)).mean(axis=1) / energy.var(axis=1))
+
+
+def _neck(fact: EndedNuts) -> str:
+    """The element whose values differ most where draws diverge, or go along with the energy."""
+    x = fact.positions
+    standard = (x - x.mean(axis=0)) / np.maximum(x.std(axis=0), np.finfo(float).tiny)
+    diverging = fact.diverging.ravel()
+    if diverging.any():
+        means = standard[diverging].mean(axis=0)
+        i = int(np.abs(means).argmax())
+        return f"{fact.names[i]} is {'large' if means[i] > 0 else 'small'}"
+    energy = fact.energy.ravel()
+    return fact.names[int(np.abs(standard.T @ (energy - energy.mean())).argmax())]

@@ -1,0 +1,62 @@
+"""The check of a model's filters at the end of a calculation, with a small part of its time."""
+
+from typing import NamedTuple
+
+from ..errors import StateSpaceFiltersError
+from ..filter_checks.checks import check_at_end, doubts, store
+from ..filter_checks.facts import FilterOutcomes, UsedFilters
+from ..filter_checks.finding import EXACT, OFF
+from ..parallel.signals import unless_interrupted
+from ..pymc_model.inspection import observes_state_space
+from ..pymc_model.posterior_draws import MIN_DRAWS
+from .words import log, sentences, tell, warn_of_filters
+
+# Runs of fewer iterations are trials.
+_LEAST_ITERATIONS = 600
+
+
+class FilterCheck(NamedTuple):
+    """Sentences about filters that are not off, for the report, and about those that are."""
+
+    said: tuple[str, ...] = ()
+    warned: tuple[str, ...] = ()
+
+    def tell(self, level: str, begin: str = "") -> None:
+        """Log the first at this level, and warn of the others."""
+        log([begin + text for text in self.said], level)
+        warn_of_filters([begin + text for text in self.warned])
+
+
+@sentences.register
+def _(fact: FilterOutcomes) -> list[str]:
+    return doubts(fact.outcomes)
+
+
+@tell.register
+def _(fact: UsedFilters, begin: str = "") -> list[str]:
+    found = check_filters(fact)
+    found.tell(fact.level, begin)
+    return list(found.warned)
+
+
+def check_filters(fact: UsedFilters) -> FilterCheck:
+    """Check filters at draws; the outcome is stored with these. Nothing after Ctrl-C."""
+    return unless_interrupted(lambda: _check(fact), FilterCheck())
+
+
+def _check(fact: UsedFilters) -> FilterCheck:
+    tree, n_draws = fact.tree, fact.tree["posterior"].sizes["draw"]
+    is_trial = n_draws < MIN_DRAWS or fact.n_iterations < _LEAST_ITERATIONS
+    if is_trial or not observes_state_space(fact.model):
+        return FilterCheck()
+    try:
+        outcomes = check_at_end(tree, fact.model, fact.filter, fact.seconds, fact.rng)
+    except StateSpaceFiltersError as error:
+        return FilterCheck((f"The filter was not checked: {error}",))
+    store(tree, outcomes)
+    said = [
+        f"{name}: {one['verdict']}"
+        for name, one in outcomes.items()
+        if one["outcome"] not in (OFF, EXACT)  # of an exact one nothing was compared
+    ]
+    return FilterCheck(tuple(said), tuple(doubts(outcomes)))

@@ -1,0 +1,86 @@
+"""Whether a filter suits a system: an error if it cannot treat it, a fact if it does so badly."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from ..compiler.lowering.compiled_system import compile_system
+from ..errors import ModelError
+from ..facts import Fact, in_words, tell
+from ..system.record import check_system
+from .protocol import Filter, System, check_filter, properties
+from .written import short_form
+
+# Up to this ratio of variances rounding errors were below 0.02 nats: 0.006 at 4e12, 0.12 at 4e14.
+NO_DIGITS = 1e13
+
+
+@dataclass(frozen=True)
+class Refusal(Fact):
+    """A filter cannot treat a system; in words, which others can."""
+
+    system: System
+    filter: Any
+
+
+@dataclass(frozen=True)
+class Choice(Fact):
+    """A filter linearises what jumps, repeats a run without noise, or has no digits."""
+
+    system: System
+    filter: Any
+
+
+@dataclass(frozen=True)
+class Bias(Fact):
+    """A filter has a bias where none is allowed; in words, which others have none."""
+
+    system: System
+    filter: Any
+
+
+def takes(filter: Filter, system: System) -> bool:
+    """Whether a filter can treat a system."""
+    try:
+        filter.check(system)
+    except ModelError:
+        return False
+    return True
+
+
+def check_system_and_filter(system: Any, filter: Any) -> None:
+    """Raise unless these are a system and a filter that can treat it."""
+    check_system(system)
+    check_filter(filter)
+    compiled = compile_system(system)
+    try:
+        filter.check(compiled)
+    except ModelError as refusal:
+        raise ModelError(f"{refusal}; {in_words(Refusal(compiled, filter))}") from None
+
+
+def check_unbiased(system: Any, filter: Any) -> bool:
+    """Raise unless a filter can treat a system without bias, and say whether it is exact.
+
+    It is not if the density of an observation is itself an approximation.
+    """
+    check_system_and_filter(system, filter)
+    compiled = compile_system(system)
+    if not is_unbiased(compiled, filter):
+        raise ModelError(
+            f"filter must be exact or unbiased for this system, got {short_form(filter)}, whose "
+            f"likelihood has a bias; {in_words(Bias(compiled, filter))}"
+        )
+    return bool(filter.is_exact_for(compiled))
+
+
+def is_unbiased(system: System, filter: Any) -> bool:
+    """Whether a filter, or the mean of its estimates, has the likelihood of a system."""
+    return properties(filter).unbiased or filter.is_exact_for(system)
+
+
+def tell_of_choice(system: Any, filter: Any) -> None:
+    """Warn if a filter that can treat a system does so badly."""
+    compiled = compile_system(system)
+    repeats = filter.noisy and compiled.is_deterministic
+    if compiled.jumping_equations or repeats or compiled.start_over_noise >= NO_DIGITS:
+        tell(Choice(compiled, filter))
