@@ -10,7 +10,6 @@ from arviz_plots.plot_collection import backend_from_object
 from arviz_plots.visuals import labelled_x, labelled_y, set_xlim, set_xticks, set_ylim
 
 from ..errors import ModelError
-from ..evidence.comparison.scaled_prior import MAX_BEYOND, MAX_PARETO_K
 from .canvas import band, canvas, curve, interval, logarithmic_ticks, size_of_panels, style_of_curve
 from .legend import add_legend
 
@@ -140,26 +139,10 @@ def _note_empty(collection: PlotCollection, found: xr.Dataset) -> None:
     """Write into the panel why it is empty, if it is."""
     if found["width_prob"].notnull().any():
         return
-    lines = [fill(line, NOTE_WIDTH) for line in ("no result at any width:", *_reasons(found))]
+    why = found.attrs.get("width_note") or "the draws do not determine it"
+    lines = [fill(line, NOTE_WIDTH) for line in ("no result at any width:", why)]
     data = xr.Dataset({"width_prob": found["width"].values[[0, -1]].mean()})
     collection.map(note, "note", data=data, ignore_aes="all", text="\n".join(lines), color="B2")
-
-
-def _reasons(found: xr.Dataset) -> list[str]:
-    """Return for each model why its evidence is unknown under other priors."""
-    causes = {
-        "width_beyond": (MAX_BEYOND, "draws reach the bounds of a prior"),
-        "width_pareto_k": (MAX_PARETO_K, "posterior about as wide as the prior"),
-    }
-    reasons = []
-    for model in found["model"].values:
-        of_model = found.sel(model=model)
-        if "width_log_evidence" not in found or of_model["width_log_evidence"].notnull().all():
-            continue
-        unknown = of_model.where(of_model["width_log_evidence"].isnull())
-        texts = [text for name, (limit, text) in causes.items() if (unknown[name] > limit).any()]
-        reasons.append(f"{model}: {texts[0] if texts else 'too few draws under these priors'}")
-    return reasons or ["the draws do not determine it"]
 
 
 def note(da: xr.DataArray, target: Any, *, text: str, **kwargs: Any) -> Any:

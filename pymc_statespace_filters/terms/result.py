@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from ..evidence.comparison.prior_sensitivity import width_factors
+from ..evidence.comparison.width_curves import width_factors
 from ..pymc_model.inspection import exactness, filters_used
 from ..pymc_model.posterior_draws import AVERAGED
 from .candidates import Candidates

@@ -16,6 +16,7 @@ from pymc.distributions.transforms import _default_transform
 from pymc.logprob.transforms import LogTransform
 from scipy.stats import norm
 
+from ..evidence.comparison.width_curves import dataset_of_curves
 from .density import Array, SubmodelDensity
 from .doubts import unreliable
 from .estimates import Weighted
@@ -113,10 +114,10 @@ def _curves(
 ) -> xr.Dataset:
     margin = norm.ppf((1 + CI_PROB) / 2) * error
     fields = {
-        "width_prob": probability,
-        "width_prob_low": np.maximum(probability - margin, 0.0),
-        "width_prob_high": np.minimum(probability + margin, 1.0),
-        "width_se": error,
+        "prob": probability,
+        "prob_low": np.maximum(probability - margin, 0.0),
+        "prob_high": np.minimum(probability + margin, 1.0),
+        "se": error,
     }
     candidates = density.candidates
     left_out = [
@@ -124,13 +125,11 @@ def _curves(
         for label, columns in zip(candidates.labels, candidates.switches.columns, strict=True)
         if (scale[columns] == "").any()
     ]
-    return xr.Dataset(
-        {name: (("model", "width"), values) for name, values in fields.items()},
-        coords={"model": candidates.labels, "width": widths},
-        attrs={
-            "ci_prob": CI_PROB,
-            "width_of": "term",
-            "width_left_out": ", ".join(left_out),
-            "width_unknown": "",
-        },
+    return dataset_of_curves(
+        fields,
+        candidates.labels,
+        widths,
+        ci_prob=CI_PROB,
+        left_out=", ".join(left_out),
+        width_of="term",
     )

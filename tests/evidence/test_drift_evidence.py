@@ -15,10 +15,9 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence.comparison.scaled_prior import ScaledPrior
 from pymc_statespace_filters.evidence.drift.conditional import fit_conditional
-from pymc_statespace_filters.evidence.drift.drift_evidence import _table
+from pymc_statespace_filters.evidence.drift.drift_evidence import _by_width, _table
 from pymc_statespace_filters.evidence.drift.marginal import ConstantModel, fit_conditionals
 from pymc_statespace_filters.evidence.drift.strengths import StrengthsAtPoints
-from pymc_statespace_filters.evidence.drift.widths import bayes_factor_by_width
 from pymc_statespace_filters.evidence.posterior_of_draws import build_posterior, reproducing_seeds
 from pymc_statespace_filters.importance import LogMean, log_mean_of_draws
 from pymc_statespace_filters.pymc_model.density import ModelDensity
@@ -155,7 +154,7 @@ def test_errors_of_the_curve_are_those_of_populations():
         idata.attrs["sampler"] = sampler
         stats = xr.Dataset({"population": (("chain", "draw"), population)})
         idata["sample_stats"] = xr.DataTree(stats)
-        found = bayes_factor_by_width(model, idata, terms, np.array([1.0]), np.log([0.5] * 2), 0.95)
+        found = _by_width(model, idata, terms, np.array([1.0]), np.log([0.5] * 2), 0.95)
         error.append(float(found["width_se"].max()))
     assert error[1] > 10 * error[0] > 0
 
@@ -164,12 +163,10 @@ def test_errors_that_both_means_share_cancel_in_the_curve():
     """If the terms are the ratios of a width, the factor there is one without an error."""
     model, observed = drifting_model(0.0, 1)
     idata = exact_draws(observed, *PRIORS["half-normal"])
-    ratios, _ = ScaledPrior(model, ("mu_strength",)).log_ratios(
-        idata["posterior"].to_dataset(), 0.5
-    )
-    found = bayes_factor_by_width(
-        model, idata, {("mu_strength",): ratios}, np.array([0.5, 1.0]), np.log([0.5] * 2), 0.95
-    )
+    draws = idata["posterior"].to_dataset()
+    ratios, _ = ScaledPrior(model, ["mu_strength"]).log_ratios(draws, 0.5)
+    terms = {("mu_strength",): ratios[..., 0]}
+    found = _by_width(model, idata, terms, np.array([0.5, 1.0]), np.log([0.5] * 2), 0.95)
     for name in ("width_log_bayes_factor", "width_se"):
         assert abs(found[name].values[0, 0]) < 1e-12 < abs(found[name].values[0, 1])
 

@@ -68,8 +68,7 @@ class TestWidths:
         np.testing.assert_allclose(se.sel(width=1), [0.01, 0.02])
         for name, own in (("line", 0.01), ("plane", 0.02)):
             rival = rivals[name]
-            draws = rival.idata["posterior"].to_dataset()
-            of_width = ScaledPrior(rival.model, ["w"]).reweighted(draws, 0.5)
+            [of_width] = ScaledPrior(rival.model, ["w"]).curve(rival.idata, [0.5])
             assert of_width.error > own / 2
             assert se.sel(model=name, width=0.5) == pytest.approx(np.hypot(own, of_width.error))
         weights = curves["width_log_evidence"] + np.log([[1], [2]])

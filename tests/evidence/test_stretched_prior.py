@@ -16,7 +16,7 @@ SHAPE = (4, 1000)
 
 
 def posterior(**draws):
-    return az.from_dict({"posterior": draws})["posterior"].to_dataset()
+    return az.from_dict({"posterior": draws})
 
 
 class OneParameter:
@@ -57,7 +57,7 @@ def test_errors_are_honest_on_a_regression():
     z, n_reliable = [], 0
     for _ in range(60):
         draws = posterior(w=target.posterior((4, 500), rng, correlation=0.5).draws)
-        found = [prior.reweighted(draws, width) for width in widths]
+        found = prior.curve(draws, widths)
         assert all(one.beyond == 0 for one in found)
         n_reliable += sum(one.is_reliable for one in found)
         z.append([(one.log_ratio - e) / one.error for one, e in zip(found, exact, strict=True)])
@@ -73,9 +73,8 @@ def exact_log_evidence(target, width):
 
 
 def check(target, model, stretched, width):
-    found = ScaledPrior(model, ["x"]).reweighted(
-        posterior(x=target.draws(np.random.default_rng(2))), width
-    )
+    draws = posterior(x=target.draws(np.random.default_rng(2)))
+    [found] = ScaledPrior(model, ["x"]).curve(draws, [width])
     assert found.is_reliable, found
     unseen = 1 / 4000  # what no draw has met is in no error
     assert abs(found.log_ratio - target.log_ratio(stretched)) < 4 * found.error + unseen
@@ -129,19 +128,16 @@ def test_what_lies_beyond_the_bounds_is_not_guessed():
     target = OneParameter(uniform(0, 1.3), peak, (0, 1.3))
     with pm.Model() as model:
         pm.Uniform("x", 0, 1.3)
-    draws = posterior(x=target.draws(np.random.default_rng(2)))
-    prior = ScaledPrior(model, ["x"])
-    wide = prior.reweighted(draws, 1.5)
+    x = target.draws(np.random.default_rng(2))
+    wide, nothing = ScaledPrior(model, ["x"]).curve(posterior(x=x), [1.5, 0.01])
     assert wide.beyond > 0.31 / 0.69
     assert not wide.is_reliable
     with pm.Model() as mirrored:
         pm.Uniform("x", -1.3, 0)
-    mirror_image = ScaledPrior(mirrored, ["x"]).reweighted(-draws, 1.5)
+    [mirror_image] = ScaledPrior(mirrored, ["x"]).curve(posterior(x=-x), [1.5])
     assert mirror_image.beyond == pytest.approx(wide.beyond)
     check(target, model, uniform(0, 0.65 * 1.6), 0.8)  # narrower is known
-    # None of the draws is left.
-    nothing = prior.reweighted(draws, 0.01)
-    assert nothing.log_ratio == -np.inf
+    assert nothing.log_ratio == -np.inf  # none of the draws is left
     assert not nothing.is_reliable
 
 
@@ -149,7 +145,7 @@ def test_truncated_priors_are_stretched_from_their_only_end():
     with pm.Model() as model:
         pm.TruncatedNormal("x", 1.0, 0.7, lower=0.5)
     x = np.random.default_rng(3).uniform(0.6, 1.4, SHAPE)
-    found = ScaledPrior(model, ["x"]).reweighted(posterior(x=x), 2.0)
+    [found] = ScaledPrior(model, ["x"]).curve(posterior(x=x), [2.0])
     ratio = norm.pdf(0.5 + (x - 0.5) / 2, 1, 0.7) / 2 / norm.pdf(x, 1, 0.7)
     assert found.log_ratio == pytest.approx(np.log(ratio.mean()), abs=1e-12)
     assert found.beyond == 0
@@ -171,7 +167,7 @@ def test_dependent_priors_are_stretched_given_what_they_depend_on():
         (["mu"], 1.3, 4 * 1.69 + 1 + 1),
         (["mu", "theta"], 0.5, 1 + 0.25 + 1),
     ]:
-        found = ScaledPrior(model, names).reweighted(given, width)
+        [found] = ScaledPrior(model, names).curve(given, [width])
         exact = norm.logpdf(y, 0, variance**0.5) - actual
         assert abs(found.log_ratio - exact) < 4 * found.error < 0.1, (names, width)
 
@@ -186,7 +182,7 @@ def test_vectors_of_every_shape():
         pm.Uniform("u", [0.0, -1.0], [4.0, 5.0], dims="place")
     v, m = rng.standard_normal((*SHAPE, 2)), rng.standard_normal((*SHAPE, 2, 3))
     u = np.full((*SHAPE, 2), 2.0)
-    found = ScaledPrior(model, ["v", "m", "u"]).reweighted(posterior(v=v, m=m, u=u), 0.8)
+    [found] = ScaledPrior(model, ["v", "m", "u"]).curve(posterior(v=v, m=m, u=u), [0.8])
     wide, actual = (multivariate_normal([1, 2], f * cov).logpdf(v) for f in (0.64, 1))
     centres = np.array([[0.0], [1.0]])
     wide_m, actual_m = (norm.logpdf(m, centres, s).sum((-1, -2)) for s in (1.6, 2.0))

@@ -50,21 +50,12 @@ NONE = [[np.nan, np.nan]]
 
 
 def test_a_panel_without_results_tells_why():
-    found = of_widths(
-        NONE * 3,
-        width_log_evidence=[[np.nan, -2.0], [np.nan, -2.0], [np.nan, np.nan]],
-        width_beyond=[[0.5, 0.0]] * 3,
-        width_pareto_k=[[0.2, 0.1], [0.2, 0.1], [0.2, 0.8]],
-    )
-    collection = plot_prior_sensitivity(found, backend="none")
-    note = collection.viz["note"]["width_prob"].item()
-    assert note["string"].split("\n") == [
-        "no result at any width:",
-        "a: draws reach the bounds of a",
-        "prior",
-        "b: posterior about as wide as",
-        "the prior",
-    ]
+    found = of_widths(NONE * 3)
+    note = plot_prior_sensitivity(found, backend="none").viz["note"]["width_prob"].item()
+    assert note["string"] == "no result at any width:\nthe draws do not determine it"
+    found.attrs["width_note"] = "The prior of k leaves most widths unknown."
+    note = plot_prior_sensitivity(found, backend="none").viz["note"]["width_prob"].item()
+    assert note["string"].split("\n")[1:] == ["The prior of k leaves most", "widths unknown."]
     assert (note["x"], note["y"]) == (0.0, 0.5)
     axes = plot_prior_sensitivity(found).viz["figure"].item().axes[0]
     assert (axes.get_xlabel(), axes.get_ylabel()) == (

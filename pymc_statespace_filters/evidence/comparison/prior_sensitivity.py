@@ -1,24 +1,24 @@
 """Sensitivity of model probabilities to the width of the priors."""
 
 import warnings
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
 import pymc as pm
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ...errors import EvidenceWarning, ModelError
 from ...former_names import former_names
 from ...pymc_model.posterior_draws import check_one_model, unconstrained_draws
 from .compare import compare_evidence
-from .scaled_prior import ReweightedEvidence, WidthCurves, width_curves
-from .selection import EvidenceLike, check_ci_prob, probabilities
+from .scaled_prior import ReweightedEvidence, ScaledPrior
+from .selection import EvidenceLike, check_ci_prob
+from .width_curves import curves_of_models, dataset_of_curves, width_factors
 
-WIDTHS = np.geomspace(0.25, 4, 17)
-
-Array = NDArray[np.float64]
+MOSTLY = 0.5  # fraction of the widths other than 1 from which a curve is mostly unknown
 
 
 @former_names(
@@ -115,72 +115,28 @@ def prior_sensitivity(
     table = compare_evidence(evidences, model_prior=model_prior, estimator=estimator)
     table = table.loc[list(evidences)]
     factors = width_factors(widths)
-    curves = _width_curves(evidences, models, var_names, factors)
-    if curves.left_out:
-        warnings.warn(curves.note, EvidenceWarning, stacklevel=3)
-    return _over_widths(table, curves.points, factors, ci_prob).assign_attrs(
+    idatas, priors = _draws_and_priors(evidences, models, var_names)
+    found = _width_curves(idatas, priors, factors.tolist(), may_leave_out=not var_names)
+    if found.left_out:
+        warnings.warn(found.note, EvidenceWarning, stacklevel=3)
+    log_evidence, se, prior = (table[name].to_numpy() for name in ("log_evidence", "se", "prior"))
+    return dataset_of_curves(
+        curves_of_models(log_evidence, se, np.log(prior), list(found.points.values()), ci_prob),
+        priors,
+        factors,
         ci_prob=ci_prob,
-        width_left_out=curves.left_out,
-        width_unknown=curves.unknown,
-        width_note=curves.note,
+        left_out=found.left_out,
+        unknown=found.unknown,
+        width_note=found.note,
     )
 
 
-def _over_widths(
-    table: pd.DataFrame,
-    of_models: Mapping[str, list[ReweightedEvidence]],
-    widths: Array,
-    ci_prob: float,
-) -> xr.Dataset:
-    found = [of_models[name] for name in table.index]
-    known = np.array([[one.is_reliable for one in of_model] for of_model in found])
-    ratio, error, n_effective, pareto_k, beyond = np.moveaxis(np.array(found), -1, 0)
-    log_evidence = np.where(known, table["log_evidence"].to_numpy()[:, np.newaxis] + ratio, np.nan)
-    se = np.where(known, np.hypot(table["se"].to_numpy()[:, np.newaxis], error), np.nan)
-    log_weight = log_evidence + np.log(table["prior"].to_numpy())[:, np.newaxis]
-    of_widths = [
-        probabilities(weights, errors, ci_prob)
-        for weights, errors in zip(log_weight.T, se.T, strict=True)
-    ]
-    prob, low, high = np.moveaxis(np.array(of_widths), 0, -1)
-    fields = {
-        "prob": prob,
-        "prob_low": low,
-        "prob_high": high,
-        "log_evidence": log_evidence,
-        "se": se,
-        "n_effective": n_effective,
-        "pareto_k": pareto_k,
-        "beyond": beyond,
-    }
-    return xr.Dataset(
-        {f"width_{name}": (("model", "width"), field) for name, field in fields.items()},
-        coords={"model": list(table.index), "width": widths},
-    )
-
-
-def width_factors(widths: ArrayLike | None) -> Array:
-    """Check the widths of priors; by default those of `WIDTHS`."""
-    if widths is None:
-        return WIDTHS
-    try:
-        factors = np.asarray(widths, dtype=np.float64)
-    except (TypeError, ValueError):
-        factors = np.empty(0)
-    if factors.ndim != 1 or factors.size == 0 or not np.isfinite(factors).all():
-        raise ModelError(f"widths must be one-dimensional finite numbers, got {widths!r}")
-    if not (factors > 0).all():
-        raise ModelError(f"widths must be positive, got {widths!r}")
-    return factors
-
-
-def _width_curves(
+def _draws_and_priors(
     evidences: Mapping[str, EvidenceLike],
     models: Mapping[str, pm.Model],
     var_names: str | Iterable[str] | None,
-    widths: Array,
-) -> WidthCurves:
-    """For each model, the evidence under its scaled priors."""
+) -> tuple[dict[str, xr.DataTree], dict[str, ScaledPrior]]:
+    """The draws of each model, and the priors that are scaled."""
     names = list(evidences)
     if not (
         isinstance(models, Mapping)
@@ -198,10 +154,80 @@ def _width_curves(
     for name in names:  # check that draws and model match
         check_one_model(idatas[name], models[name])
         unconstrained_draws(idatas[name], models[name])
-    return width_curves(
-        models,
-        {name: idatas[name] for name in names},
-        {name: [one for one in free[name] if not chosen or one in chosen] for name in names},
-        widths.tolist(),
-        may_leave_out=not chosen,
-    )
+    return idatas, {
+        name: ScaledPrior(models[name], [one for one in free[name] if not chosen or one in chosen])
+        for name in names
+    }
+
+
+class _WidthCurves(NamedTuple):
+    """The curves of all models, and what is said of them: see `prior_sensitivity`."""
+
+    points: dict[str, list[ReweightedEvidence]]
+    left_out: str
+    unknown: str
+    note: str
+
+
+def _width_curves(
+    idatas: Mapping[str, xr.DataTree],
+    priors: Mapping[str, ScaledPrior],
+    widths: Sequence[float],
+    *,
+    may_leave_out: bool,
+) -> _WidthCurves:
+    """Reweight the draws of each model to every width of its priors.
+
+    One parameter that the data leave undetermined, or whose posterior reaches the end of its prior,
+    makes the evidence unknown under almost every width, although the other priors could be varied.
+    If ``may_leave_out``, priors that do so in one model keep their width in all models, because a
+    parameter that models share is to have the same prior in them.
+    """
+    points = {name: one.curve(idatas[name], widths) for name, one in priors.items()}
+    spoiling = {
+        name: _spoiling(idatas[name], priors[name], widths)
+        for name, curve in points.items()
+        if _is_mostly_unknown(curve, widths)
+    }
+    blamed = list(dict.fromkeys(prior for of_model in spoiling.values() for prior in of_model))
+    rest = {name: [p for p in one.names if p not in blamed] for name, one in priors.items()}
+    leaves_out = may_leave_out and bool(blamed) and any(rest.values())
+    became = "keeps its width" if leaves_out else "leaves most widths unknown"
+    notes = [f"The prior of {prior} {became}: {_reasons(spoiling, prior)}." for prior in blamed]
+    unknown = [] if leaves_out else list(blamed)
+    if leaves_out:
+        points = {name: one.curve(idatas[name], widths, rest[name]) for name, one in priors.items()}
+    for name, curve in points.items():
+        if _is_mostly_unknown(curve, widths) and (leaves_out or not spoiling[name]):
+            unknown.append(f"several parameters of {name!r} together")
+            notes.append(
+                f"The draws of {name!r} do not determine the evidence when its priors are scaled "
+                "together: name fewer of them in var_names."
+            )
+    left_out = ", ".join(blamed if leaves_out else [])
+    return _WidthCurves(points, left_out, ", ".join(unknown), " ".join(notes))
+
+
+def _spoiling(idata: xr.DataTree, priors: ScaledPrior, widths: Sequence[float]) -> dict[str, str]:
+    """The priors that are unknown at most widths if they alone are scaled, with the reasons."""
+    alone = {name: priors.curve(idata, widths, [name]) for name in priors.names}
+    return {
+        name: Counter(one.reason for one in curve if not one.is_reliable).most_common(1)[0][0]
+        for name, curve in alone.items()
+        if _is_mostly_unknown(curve, widths)
+    }
+
+
+def _is_mostly_unknown(points: Sequence[ReweightedEvidence], widths: Sequence[float]) -> bool:
+    others = [one for one, width in zip(points, widths, strict=True) if width != 1]
+    unknown = sum(not one.is_reliable for one in others)
+    return bool(others) and unknown >= MOSTLY * len(others)
+
+
+def _reasons(spoiling: Mapping[str, Mapping[str, str]], prior: str) -> str:
+    """Why a prior spoils curves, and those of which models."""
+    models: dict[str, list[str]] = {}
+    for name, of_model in spoiling.items():
+        if prior in of_model:
+            models.setdefault(of_model[prior], []).append(repr(name))
+    return "; ".join(f"in {', '.join(names)} {why}" for why, names in models.items())

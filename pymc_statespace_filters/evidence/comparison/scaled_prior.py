@@ -9,12 +9,10 @@ The centre c is the end of a half-line, or an end at zero, so that the scaled pr
 quantity has the same support; otherwise it is PyMC's support point. A prior that depends on other
 variables is scaled conditionally on them.
 
-One parameter that the data leave undetermined, or whose posterior reaches the end of its prior,
-makes the evidence unknown under almost every width, although the other priors could be varied.
+The sum of the log-ratios of several priors is that of all of them together.
 """
 
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +29,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from ...compiler.native.rows import at_points
 from ...errors import ModelError
-from ...importance import MIN_EFFECTIVE, SAME, log_mean_of_draws, pareto_k
+from ...importance import MIN_EFFECTIVE, SAME, log_mean, log_mean_of_draws, mcse, pareto_k
 from ...pymc_model.posterior_draws import populations_of
 from ...pymc_model.prior import can_sample
 
@@ -41,8 +39,6 @@ MAX_PARETO_K = 0.5  # above, the weights have no variance and their mean no stan
 MAX_BEYOND = 0.02
 
 Array = NDArray[np.float64]
-
-MOSTLY = 0.5  # fraction of the widths other than 1 from which a curve is mostly unknown
 
 
 class ReweightedEvidence(NamedTuple):
@@ -63,8 +59,18 @@ class ReweightedEvidence(NamedTuple):
             and self.beyond <= MAX_BEYOND
         )
 
+    @property
+    def reason(self) -> str:
+        """Why it is unreliable, if it is."""
+        if self.beyond > MAX_BEYOND:
+            return "the posterior reaches the end of the support, and no draws lie beyond it"
+        if self.pareto_k > MAX_PARETO_K:
+            return "the posterior is nearly as wide as the prior"
+        return f"fewer than {MIN_EFFECTIVE:g} effective draws lie under a scaled prior"
+
 
 UNCHANGED = ReweightedEvidence(0.0, 0.0, np.inf, -np.inf, 0.0)
+UNKNOWN = ReweightedEvidence(np.nan, np.nan, 0.0, np.inf, 0.0)
 
 
 class ScaledPrior:
@@ -77,14 +83,15 @@ class ScaledPrior:
     """
 
     def __init__(self, model: pm.Model, names: Iterable[str]) -> None:
-        scaled = [model[name] for name in names]
+        self.names = tuple(names)
+        scaled = [model[name] for name in self.names]
         for rv in scaled:
             _check_scalable(rv, model)
         width = pt.dscalar("width")
         values = {rv: rv.type(name=rv.name) for rv in model.free_RVs}
         sizes = {name: int(np.prod(shape)) for name, shape in model.eval_rv_shapes().items()}
         terms = [_log_ratio(rv, values[rv], width, sizes[rv.name]) for rv in scaled]
-        outputs = [pt.sum(pt.stack(of_each)) for of_each in zip(*terms, strict=True)]
+        outputs = [pt.stack(of_each) for of_each in zip(*terms, strict=True)]
         self._types = {value.name: value.dtype for value in values.values()}
         points, at_draws = at_points(list(values.values()), clone_replace(outputs, values))
         # One call handles all draws, which is not worth machine code.
@@ -92,38 +99,57 @@ class ScaledPrior:
             [width, *points], at_draws, on_unused_input="ignore", mode="FAST_COMPILE"
         )
 
-    def reweighted(
+    def curve(
         self,
-        posterior: xr.Dataset,
-        width: float,
-        population: NDArray[np.int64] | None = None,
-    ) -> ReweightedEvidence:
-        """The evidence under priors scaled by ``width``, from draws of all variables.
+        idata: xr.DataTree,
+        widths: Sequence[float] | Array,
+        names: Iterable[str] | None = None,
+        log_terms: Array | None = None,
+    ) -> list[ReweightedEvidence]:
+        """The evidence at every width, from draws; of some of the priors, if ``names`` are given.
 
-        ``population`` (chain, draw) is as in `mcse`.
+        With ``log_terms`` (chain, draw), whose mean the evidence is to be divided by, the error is
+        that of the quotient: both means are of the same draws.
         """
-        return average_ratios(*self.log_ratios(posterior, width), population)
+        chosen = [i for i, name in enumerate(self.names) if names is None or name in names]
+        if not chosen:
+            return [UNCHANGED] * len(widths)
+        posterior, population = idata["posterior"].to_dataset(), populations_of(idata)
+
+        def at(width: float) -> ReweightedEvidence:
+            found = self.log_ratios(posterior, width)
+            log_ratio, beyond = (one[..., chosen].sum(axis=-1) for one in found)
+            mean = average_ratios(log_ratio, beyond, population)
+            if log_terms is None or not mean.is_reliable:
+                return mean
+            terms = np.exp(log_ratio - mean.log_ratio) - np.exp(log_terms - log_mean(log_terms))
+            return mean._replace(error=mcse(terms, population))
+
+        return [at(float(width)) for width in widths]
 
     def log_ratios(self, posterior: xr.Dataset, width: float) -> tuple[Array, Array]:
-        """Log-ratios p_w / p of draws (chain, draw), and their `_beyond`."""
-        shape = posterior.sizes["chain"], posterior.sizes["draw"]
+        """Log-ratios p_w / p at the draws (chain, draw, prior), and their `_beyond`."""
+        shape = posterior.sizes["chain"], posterior.sizes["draw"], len(self.names)
         rows = [
             np.concatenate(posterior[name].transpose("chain", "draw", ...).values).astype(dtype)
             for name, dtype in self._types.items()
         ]
         with np.errstate(all="ignore"):  # a narrow prior may be zero at a draw
             log_ratio, beyond = self._function(width, *rows)
-        return log_ratio.reshape(shape), beyond
+        return log_ratio.reshape(shape), beyond.reshape(shape)
 
 
 def average_ratios(
     log_ratio: Array, beyond: Array, population: NDArray[np.int64] | None = None
 ) -> ReweightedEvidence:
-    """Average the ratios p_w / p of draws (chain, draw), with diagnostics from their `_beyond`."""
+    """Average the ratios p_w / p of draws (chain, draw), with diagnostics from their `_beyond`.
+
+    ``population`` (chain, draw) is as in `mcse`.
+    """
     peak = log_ratio.max()
     if np.isneginf(peak):
         return ReweightedEvidence(-np.inf, np.inf, 0.0, np.inf, 0.0)
-    fraction = float(np.average(beyond.ravel(), weights=np.exp(log_ratio - peak).ravel()))
+    fraction = float(np.average(beyond, weights=np.exp(log_ratio - peak)))
     if np.ptp(log_ratio) < SAME:  # a wider Uniform prior: all weights are equal
         return ReweightedEvidence(float(peak), 0.0, np.inf, -np.inf, fraction)
     mean = log_mean_of_draws(log_ratio, population)
@@ -190,117 +216,3 @@ def _beyond(
     at_upper = (value > upper - EDGE * length) * (upper - centre)
     bounded = pt.isfinite(length)
     return pt.switch(bounded, n_edges * (at_lower + at_upper) / length, 0.0).sum()
-
-
-class WidthCurve(NamedTuple):
-    """The reweighted evidence of a model at every width.
-
-    ``spoiling`` are the priors that alone are unknown at most widths, each with the reason, and
-    ``is_unknown`` is whether most of the curve is.
-    """
-
-    points: list[ReweightedEvidence]
-    spoiling: dict[str, str]
-    is_unknown: bool
-
-
-class WidthCurves(NamedTuple):
-    """The curves of all models, and what is said of them: see `prior_sensitivity`."""
-
-    points: dict[str, list[ReweightedEvidence]]
-    left_out: str
-    unknown: str
-    note: str
-
-
-def width_curves(
-    models: Mapping[str, pm.Model],
-    idatas: Mapping[str, xr.DataTree],
-    scaled: Mapping[str, Sequence[str]],
-    widths: Sequence[float],
-    *,
-    may_leave_out: bool,
-) -> WidthCurves:
-    """Reweight the draws of each model to every width of the priors of its variables ``scaled``.
-
-    If ``may_leave_out``, priors that spoil the curve of one model keep their width in all models,
-    because a parameter that models share is to have the same prior in them.
-    """
-
-    def curves(names: Mapping[str, Sequence[str]]) -> dict[str, WidthCurve]:
-        return {
-            name: _width_curve(model, idatas[name], names[name], widths)
-            for name, model in models.items()
-        }
-
-    found = curves(scaled)
-    spoiling = list(dict.fromkeys(prior for curve in found.values() for prior in curve.spoiling))
-    rest = {name: [one for one in given if one not in spoiling] for name, given in scaled.items()}
-    leaves_out = may_leave_out and bool(spoiling) and any(rest.values())
-    became = "keeps its width" if leaves_out else "leaves most widths unknown"
-    notes = [f"The prior of {prior} {became}: {_reasons(found, prior)}." for prior in spoiling]
-    unknown = [] if leaves_out else list(spoiling)
-    if leaves_out:
-        found = curves(rest)
-    for name, curve in found.items():
-        if curve.is_unknown and not curve.spoiling:
-            unknown.append(f"several parameters of {name!r} together")
-            notes.append(
-                f"The draws of {name!r} do not determine the evidence when its priors are scaled "
-                "together: name fewer of them in var_names."
-            )
-    return WidthCurves(
-        {name: curve.points for name, curve in found.items()},
-        ", ".join(spoiling if leaves_out else []),
-        ", ".join(unknown),
-        " ".join(notes),
-    )
-
-
-def _reasons(curves: Mapping[str, WidthCurve], prior: str) -> str:
-    """Why a prior spoils curves, and those of which models."""
-    models: dict[str, list[str]] = {}
-    for name, curve in curves.items():
-        if prior in curve.spoiling:
-            models.setdefault(curve.spoiling[prior], []).append(repr(name))
-    return "; ".join(f"in {', '.join(names)} {why}" for why, names in models.items())
-
-
-def _width_curve(
-    model: pm.Model, idata: xr.DataTree, names: Sequence[str], widths: Sequence[float]
-) -> WidthCurve:
-    """One model; if most is unknown, the priors are varied one by one to find those to blame."""
-    posterior, population = idata["posterior"].to_dataset(), populations_of(idata)
-
-    def curve(scaled: Sequence[str]) -> list[ReweightedEvidence]:
-        if not scaled:
-            return [UNCHANGED] * len(widths)
-        priors = ScaledPrior(model, scaled)
-        return [priors.reweighted(posterior, width, population) for width in widths]
-
-    points = curve(names)
-    if not _is_mostly_unknown(points, widths):
-        return WidthCurve(points, {}, is_unknown=False)
-    alone = {name: curve([name]) for name in names} if len(names) > 1 else {names[0]: points}
-    unknown = {name: one for name, one in alone.items() if _is_mostly_unknown(one, widths)}
-    return WidthCurve(points, {name: _reason(one) for name, one in unknown.items()}, True)
-
-
-def _is_mostly_unknown(points: Sequence[ReweightedEvidence], widths: Sequence[float]) -> bool:
-    others = [one for one, width in zip(points, widths, strict=True) if width != 1]
-    unknown = sum(not one.is_reliable for one in others)
-    return bool(others) and unknown >= MOSTLY * len(others)
-
-
-def _reason(points: Sequence[ReweightedEvidence]) -> str:
-    """The most frequent reason why a reweighted evidence is unknown."""
-    reasons = Counter(_reason_of(one) for one in points if not one.is_reliable)
-    return reasons.most_common(1)[0][0]
-
-
-def _reason_of(point: ReweightedEvidence) -> str:
-    if point.beyond > MAX_BEYOND:
-        return "the posterior reaches the end of the support, and no draws lie beyond it"
-    if point.pareto_k > MAX_PARETO_K:
-        return "the posterior is nearly as wide as the prior"
-    return f"fewer than {MIN_EFFECTIVE:g} effective draws lie under a scaled prior"

@@ -17,6 +17,7 @@ from ...importance import (
     LogMean,
     disagreement,
     largest_good_k,
+    log_mean,
     log_mean_of_draws,
     pareto_k,
 )
@@ -26,13 +27,13 @@ from ...pymc_model.inspection import given_model
 from ...pymc_model.posterior_draws import noise_was_moved, populations_of, posterior_group
 from ...system.checks import check_random_seed
 from ..checks import check_convergence
-from ..comparison.prior_sensitivity import width_factors
+from ..comparison.scaled_prior import UNCHANGED, UNKNOWN, ScaledPrior
 from ..comparison.selection import check_ci_prob, prior_weights, probabilities
+from ..comparison.width_curves import curves_of_models, dataset_of_curves, width_factors
 from ..posterior_of_draws import build_posterior, reproducing_seeds
 from .marginal import ConstantModel
 from .strengths import chosen_strengths
 from .table import DriftTable, sentences
-from .widths import bayes_factor_by_width
 
 MODELS = ["constant", "drifting"]
 
@@ -179,7 +180,7 @@ def drift_evidence(
     if of_chains:
         warnings.warn(f"drift: {'; '.join(of_chains)}", EvidenceWarning, stacklevel=2)
     known = {one: None if doubts[one] else terms for one, terms in log_terms.items()}
-    curves = bayes_factor_by_width(model, idata, known, factors, np.log(prior), ci_prob)
+    curves = _by_width(model, idata, known, factors, np.log(prior), ci_prob)
     others = [rv.name for rv in model.free_RVs if rv.name not in names]
     return DriftTable(table, widths=curves, sentences=[*sentences(table, others, ci_prob)])
 
@@ -220,6 +221,44 @@ def _doubts(
         )
     elif not are_populations and (reason := disagreement(log_terms)):
         yield reason
+
+
+def _by_width(
+    model: pm.Model,
+    idata: xr.DataTree,
+    log_terms: Mapping[tuple[str, ...], Array | None],
+    widths: Array,
+    log_prior: Array,
+    ci_prob: float,
+) -> xr.Dataset:
+    """The probability of drift for strengths whose priors are scaled together.
+
+    ``log_terms`` has the terms (chain, draw) of the mean Z_0 / Z_1 for each set of strengths, or
+    None where that mean is unknown; ``log_prior`` (2,) is that of constant and drifting. The
+    evidence of the constant model is one, at all widths.
+    """
+    fields: dict[str, list[Array]] = {}
+    for names, terms in log_terms.items():
+        value, drifting = np.nan, [UNKNOWN] * len(widths)
+        if terms is not None:
+            value = -log_mean(terms)
+            drifting = ScaledPrior(model, names).curve(idata, widths, log_terms=terms)
+        found = curves_of_models(
+            np.array([0.0, value]),
+            np.zeros(2),
+            log_prior,
+            [[UNCHANGED] * len(widths), drifting],
+            ci_prob,
+        )
+        found["log_bayes_factor"] = found.pop("log_evidence")
+        for name, (_, of_drift) in found.items():
+            fields.setdefault(name, []).append(of_drift)
+    return dataset_of_curves(
+        {name: np.array(rows) for name, rows in fields.items()},
+        [f"drift, {', '.join(names)}" for names in log_terms],
+        widths,
+        ci_prob=ci_prob,
+    )
 
 
 def _table(
