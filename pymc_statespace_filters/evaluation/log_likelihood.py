@@ -23,6 +23,7 @@ from ..system.model import StateSpaceModel
 from ..system.panel import CheckedPanel, checked_panel
 from ..system.parameters import flat_parameters, panel_parameters
 from ..system.record import check_seed, checked_record
+from .exact_rows import check_exact_rows
 from .health import tell_of_health
 
 
@@ -118,6 +119,7 @@ def log_likelihood(
         raise ModelError(f"cores must be 1 without a panel, whose records it divides, got {cores}")
     placed = checked_record(system, given)
     system, record = placed.system, placed.arguments
+    check_exact_rows(system, [placed.axis], placed.observed)
     theta = flat_parameters(system, params)
     seeds = check_seed("seed", seed)
     try:
@@ -154,6 +156,7 @@ def _of_panel(
         raise ModelError("comm must be None for a panel: every rank evaluates all records")
     table = checked_panel(system, given)
     system = table.system
+    check_exact_rows(system, table.axes, table.observed, table.records.labels)
     theta = panel_parameters(system, params, table.records)
     seeds = check_seed("seed", seed)
     if seeds.ndim:

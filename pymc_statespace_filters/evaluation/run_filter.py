@@ -25,6 +25,7 @@ from ..system.parameters import flat_parameters, panel_parameters
 from ..system.placement import Earlier
 from ..system.record import CheckedRecord, check_seed, checked_record
 from ..system.steps import check_at, rows_at
+from .exact_rows import check_exact_rows
 from .health import tell_of_health
 
 STATE, _RECORD, _RESETS = "filter_state", "filter_state_record", "accumulators_reset"
@@ -153,6 +154,8 @@ def run_filter(
     system = table.system
     common = attributes(system, filter, [each[0] for each in arguments], noise, arguments[0][4])
     axes = [table.axis] if isinstance(table, CheckedRecord) else table.axes
+    if state is None:
+        check_exact_rows(system, axes, table.observed, labels)
     ends = [float(axis.times(axis.steps[-1])) for axis in axes]
     clock = table.clock.stored() | {"ends": ends}
     if system.accumulators:

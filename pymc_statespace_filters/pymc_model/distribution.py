@@ -13,6 +13,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from ..compiler.lowering.compiled_system import compile_system
 from ..errors import ModelError
+from ..evaluation.exact_rows import check_exact_rows
 from ..facts import in_words
 from ..filters.checks import Refusal, check_system_and_filter, tell_of_choice
 from ..filters.protocol import Filter, properties
@@ -182,11 +183,13 @@ class StateSpace(Continuous):
         if panel is None:
             theta = symbolic_parameters(system, values, others)
             record = symbolic_record(system, given)
+            check_exact_rows(record.system, [record.axis], record.observed)
             n_rows, t0 = record.axis.steps.size, record.axis.t0
             row_dim, component_dim = _dims(dims, f"{full_name}_time")
             row_coords: Any = record.clock.shown(record.axis.times(record.axis.steps))
         else:
             record = symbolic_panel(system, given)
+            check_exact_rows(record.system, record.axes, record.observed, record.records.labels)
             values = in_order_of_records(system, values, model, record)
             theta = symbolic_panel_parameters(system, values, record, others)
             n_rows, t0 = int(np.diff(record.records.starts).max()), record.t0

@@ -124,11 +124,11 @@ def test_rounding_errors_are_told_from_a_sensor_that_is_not_defined():
     assert "initial_cov of at most 1e8 times" in Failure.SINGULAR.cure
 
 
-def test_more_exact_sensors_than_shocks_are_a_stochastic_singularity():
+def test_exact_sensors_of_shocks_that_are_one_are_a_stochastic_singularity():
     """By rounding, this singular covariance is positive definite: 16 nats in the first row."""
-    loadings, none = np.array([[1.0], [0.3]]), np.zeros((2, 2))
+    loadings, none = np.array([[1.0, 0.5], [0.3, 0.15]]), np.zeros((2, 2))
     exact = system(
-        transition=lambda x, q, a: a * x + loadings @ q, process_noise=[[1.0]],
+        transition=lambda x, q, a: a * x + loadings @ q, process_noise=np.eye(2),
         observation=lambda x: x, observation_noise=none, initial_mean=[1.0, 1.0], initial_cov=none,
     )  # fmt: skip
     observed = np.array([[2.0, 1.3]] * 3)

@@ -76,10 +76,10 @@ def undriven_states(system: StateSpaceModel) -> list[int]:
     """
     symbols = symbols_of(system)
     step = _sources(call(system.equations.transition, system, symbols), symbols)
-    start = _sources_of_start(system, symbols)
+    start = sources_of_start(system, symbols)
     if step is None or start is None:
         return []
-    still = _still_noises(system, symbols)
+    still = still_noises(system, symbols)
     driven = {i for i in range(system.n) if any(q not in still for q in _of("q", step[i]))}
     uncertain = {i for i in range(system.n) if start[i]}
     driven, uncertain = (_reached(step, states) for states in (driven, uncertain))
@@ -97,7 +97,7 @@ def _sources(
     return [{str(e.args[0]) for e in in_order([value], {}) if e.op is None} for value in values]
 
 
-def _sources_of_start(
+def sources_of_start(
     system: StateSpaceModel, symbols: Mapping[str, TensorVariable]
 ) -> list[Any] | None:
     """For each state something that is true if its start is uncertain."""
@@ -106,16 +106,16 @@ def _sources_of_start(
         z = draw.inputs[1].type("z")
         found = _sources(draw.bind([symbols["theta"], z])[0], {**symbols, "z": z})
         return None if found is None else [_of("z", names) for names in found]
-    variances = _zeros(pt.diagonal(call(system.equations.initial_cov, system, symbols)), symbols)
+    variances = zeros(pt.diagonal(call(system.equations.initial_cov, system, symbols)), symbols)
     return [not is_zero for is_zero in variances] if len(variances) == system.n else None
 
 
-def _still_noises(system: StateSpaceModel, symbols: Mapping[str, TensorVariable]) -> set[int]:
+def still_noises(system: StateSpaceModel, symbols: Mapping[str, TensorVariable]) -> set[int]:
     """The noises whose variance is zero."""
     if system.equations.process_noise is None:
         return set()
     variances = pt.diagonal(call(system.equations.process_noise, system, symbols))
-    return {i for i, is_zero in enumerate(_zeros(variances, symbols)) if is_zero}
+    return {i for i, is_zero in enumerate(zeros(variances, symbols)) if is_zero}
 
 
 def _of(vector: str, names: set[str]) -> set[int]:
@@ -235,7 +235,7 @@ def has_exact_sensor(system: StateSpaceModel) -> bool:
     symbols = symbols_of(system)
     _, cov = observation_moments(system, symbols)
     if not isinstance(cov, Constant):
-        return any(_zeros(pt.diagonal(cov), symbols))
+        return any(zeros(pt.diagonal(cov), symbols))
     eigenvalues = np.linalg.eigvalsh(cov.data)
     return bool(eigenvalues.min() <= 1e-12 * eigenvalues.max())
 
@@ -292,10 +292,10 @@ def process_noise_reaches_every_state(system: StateSpaceModel) -> bool:
 
 def _is_zero(matrix: TensorVariable, symbols: Mapping[str, TensorVariable]) -> bool:
     """Whether every element is zero whatever the symbols; False where that cannot be decided."""
-    return all(_zeros(matrix.ravel(), symbols))
+    return all(zeros(matrix.ravel(), symbols))
 
 
-def _zeros(vector: TensorVariable, symbols: Mapping[str, TensorVariable]) -> list[bool]:
+def zeros(vector: TensorVariable, symbols: Mapping[str, TensorVariable]) -> list[bool]:
     """Which elements are zero whatever the symbols; none where that cannot be decided."""
     (folded,) = constant_fold([vector], raise_not_constant=False)
     if not isinstance(folded, Variable):

@@ -1,0 +1,70 @@
+"""Rows that fix more numbers exactly than are random: a record without a density."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from pytensor.compile.sharedvalue import SharedVariable
+from pytensor.graph.basic import Constant
+
+from ..compiler.lowering.compiled_system import compile_system
+from ..compiler.lowering.directions import Directions, directions_of
+from ..errors import ModelError
+from ..system.model import StateSpaceModel
+from ..system.time_axis import TimeAxis
+
+
+def check_exact_rows(
+    system: StateSpaceModel,
+    axes: Sequence[TimeAxis],
+    observed: Any,
+    labels: Sequence[Any] | None = None,
+) -> None:
+    """Raise if sensors without noise see more numbers than are random: stochastic singularity.
+
+    The predicted covariance of such a row is singular, and the likelihood that a filter computes is
+    rounding, which may be finite. ``observed`` (J, p), an array or a symbol, has the rows of all
+    records one below the other; ``labels`` are the records of a panel.
+    """
+    if isinstance(observed, SharedVariable):
+        observed = observed.get_value()
+    elif isinstance(observed, Constant):
+        observed = observed.data
+    compiled = compile_system(system)
+    if not (isinstance(observed, np.ndarray) and compiled.has_exact_sensor):
+        return
+    directions, start = directions_of(compiled.asked), 0
+    for number, axis in enumerate(axes):
+        rows = observed[start : start + axis.steps.size]
+        if (found := _singular_row(directions, axis.steps, rows)) is not None:
+            row, n_random = found
+            seen = np.flatnonzero(directions.exact & ~np.isnan(rows[row]))
+            names = ", ".join(system.observables[i] for i in seen)
+            record = "" if labels is None else f" of the record {labels[number]!r}"
+            raise ModelError(
+                f"observed has a stochastic singularity in row {start + row}{record}, at step "
+                f"{axis.steps[row]}: the sensors without noise, {names}, fix {len(seen)} "
+                f"number{'s' * (len(seen) > 1)}, and at most {n_random} can vary given the rows "
+                "before, so that the record has no density. Give sensors noise "
+                "(observation_noise), leave one out (NaN in its column), or let more independent "
+                "noises reach the state"
+            )
+        start += len(rows)
+
+
+def _singular_row(
+    directions: Directions, steps: np.ndarray, observed: np.ndarray
+) -> tuple[int, int] | None:
+    """The first row that fixes more numbers than are random, and how many are; None if none does.
+
+    Each step adds the numbers of its noises, up to those of the state; a row takes away those that
+    it fixes.
+    """
+    n_random, before = directions.at_start, 0
+    n_fixed = np.count_nonzero(directions.exact & ~np.isnan(observed), axis=1)
+    for row, (step, fixed) in enumerate(zip(steps.tolist(), n_fixed.tolist(), strict=True)):
+        n_random = min(directions.n, n_random + directions.per_step * (step - before))
+        if fixed > n_random:
+            return row, n_random
+        n_random, before = n_random - fixed, step
+    return None
