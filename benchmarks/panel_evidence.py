@@ -17,8 +17,7 @@ import pymc_statespace_filters as psf
 
 SIZES, N_ROWS = (12, 30, 100), 3
 PRIOR_SD, SPREAD = 2.0, 0.7  # of the common level, and of the levels about it
-ESTIMATORS = ("bridge", "importance", "chib_jeliazkov", "tempered_smc")
-MOST_TEMPERED = 30  # records: its particles begin at the prior
+ESTIMATORS = ("bridge", "importance", "chib_jeliazkov")
 SYSTEM = psf.StateSpaceModel(
     transition=lambda x, q, level: [level + q[0]],
     process_noise=[[0.5]],
@@ -79,8 +78,6 @@ def panel_evidence() -> list[PanelEvidence]:
                 progressbar=False, quiet=True,
             )  # fmt: skip
         for estimator in ESTIMATORS:
-            if estimator == "tempered_smc" and n_records > MOST_TEMPERED:
-                continue
             start = time.perf_counter()
             estimate = psf.estimate_evidence(
                 idata, model, estimators=[estimator], random_seed=1, progressbar=False

@@ -15,7 +15,6 @@ LEVEL = 0.001
 NEGLIGIBLE = 0.05  # nats
 _SMALLEST_ERROR = 1e-6  # avoids division by zero: an estimate may be exact
 
-FROM_PRIOR = ("prior_monte_carlo", "tempered_smc")
 # Bridge sampling uses all draws at once, Chib and Jeliazkov's ordinate those near one point.
 ESTIMATE, CHECK = "bridge", "chib_jeliazkov"
 
@@ -28,10 +27,10 @@ class Agreement:
     ----------
     p_value : float
         Of Cochran's chi-square test of homogeneity, which treats the estimates as independent.
-        Estimates from the same draws, or of the same proposals as those of "bridge" and
-        "warp_bridge", have correlated errors: they differ by less than independent ones, and the
-        test is conservative. An error that they have in common is part of the standard error of
-        each, and no difference shows it. 1 if fewer than two estimates have a standard error.
+        Estimates from the same draws have correlated errors: they differ by less than independent
+        ones, and the test is conservative. An error that they have in common is part of the
+        standard error of each, and no difference shows it. 1 if fewer than two estimates have a
+        standard error.
     difference : float
         Largest minus smallest estimate, in nats.
     diagnosis : str
@@ -80,29 +79,11 @@ def _diagnose(evidences: Mapping[str, Evidence]) -> str:
     if low.log_evidence > high.log_evidence:
         low, high = high, low
     gap = f"{high.estimator} is {high.log_evidence - low.log_evidence:.2f} above {low.estimator}"
-    from_prior = [e.estimator in FROM_PRIOR for e in (low, high)]
-    if from_prior == [False, True]:
-        cause = (
-            "the chains have probably not visited all of the posterior and miss a mode or a tail: "
-            "run more chains, longer, from dispersed starting points"
-        )
-    elif from_prior == [True, False]:
-        cause = (
-            f"{low.estimator} has probably missed a narrow peak or a tail that the chains have "
-            "found: it is less reliable the narrower the posterior is relative to the prior, or "
-            "one mode relative to another"
-        )
-    elif all(from_prior):
-        cause = "the posterior is too narrow relative to the prior for prior_monte_carlo"
-    elif doubtful := _doubtful(low, high):
-        cause = doubtful
-    else:
-        cause = (
-            "the draws are too few, or the posterior is far from the shape that the estimators "
-            "fit to it (several modes, heavy tails): run longer chains, and add tempered_smc, "
-            "which says whether its particles and the draws lie in the same places; a narrow mode "
-            "that both have missed remains unknown"
-        )
+    cause = _doubtful(low, high) or (
+        "the draws are too few, or the posterior is far from the shape that the estimators fit to "
+        "it (several modes, heavy tails): draw more, and compare with the evidence of sample_smc, "
+        "which starts from the prior; a narrow mode that both have missed remains unknown"
+    )
     return f"{gap}; {cause}"
 
 

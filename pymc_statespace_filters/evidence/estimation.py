@@ -22,24 +22,20 @@ from .agreement import Agreement, assess_agreement
 from .estimators.bridge import Bridge
 from .estimators.chib_jeliazkov import ChibJeliazkov
 from .estimators.importance import Importance
-from .estimators.laplace import Laplace
-from .estimators.prior_monte_carlo import PriorMonteCarlo
-from .estimators.protocol import Estimator, uses_draws
-from .estimators.tempered_smc import TemperedSMC
+from .estimators.protocol import Estimator
 from .evidence import Evidence
 from .runner import run_estimators
 
-_BUILT_IN: tuple[Estimator, ...] = (
-    ChibJeliazkov(),
-    Bridge(),
-    Bridge(warped=True),
-    Importance(),
-    TemperedSMC(),
-    PriorMonteCarlo(),
-    Laplace(),
-)
+_BUILT_IN: tuple[Estimator, ...] = (ChibJeliazkov(), Bridge(), Importance())
 DEFAULT = ("chib_jeliazkov", "bridge")
 ESTIMATORS: Mapping[str, Estimator] = {estimator.name: estimator for estimator in _BUILT_IN}
+# Names that were once among them.
+_INSTEAD = {
+    "laplace": "'bridge' or 'importance', whose errors are known",
+    "prior_monte_carlo": "the evidence of sample_smc, which needs no draws",
+    "tempered_smc": "the evidence of sample_smc, which needs no draws",
+    "warp_bridge": "'bridge', or 'importance' for skewed posteriors",
+}
 
 
 @shared_by_ranks
@@ -100,8 +96,8 @@ def chib_jeliazkov(
     ------
     ModelError
         If an argument is invalid, a free variable is discrete, the draws are too few, do not
-        vary, are those of `select_terms`, or of `sample_smc` and of fewer than four populations
-        or mostly of one, or chains of held noise have different seeds.
+        vary, are those of `select_terms` or `sample_smc`, or chains of held noise have different
+        seeds.
     DataMismatchError
         If the draws lack free variables of the model, belong to another model or other data, or
         the likelihood estimates of the chain cannot be recovered.
@@ -211,27 +207,20 @@ def estimate_evidence(
     filter : filter, optional
         Another filter than that of the draws, unbiased as `BootstrapPF` or exact: the evidence is
         then that of the model with this filter in every observed StateSpace variable. The draws
-        only say where the posterior lies, so that "importance" is the default, and
-        "chib_jeliazkov", "bridge", "warp_bridge" and "laplace" are refused. By default the filter
-        of the model.
+        only say where the posterior lies, and "importance" is the only estimator. By default the
+        filter of the model.
     estimators : str, Estimator, or iterable of them, optional
         By default "chib_jeliazkov" and "bridge"; with draws of `sample_smc`, whose populations are
-        few independent ones, "importance", whose error they do not enter: "chib_jeliazkov",
-        "bridge" and "warp_bridge" need four of them. Names among
-        "chib_jeliazkov", "bridge" (bridge sampling to a normal distribution), "warp_bridge"
-        (warp-III bridge sampling, for skewed posteriors), "importance" (importance sampling from a
-        mixture of Student-t distributions, for several modes), "tempered_smc" (tempered sequential
-        Monte Carlo from the prior, guided by the draws), "prior_monte_carlo" (mean likelihood of
-        prior draws, for few parameters) and "laplace" (Laplace's approximation, without a standard
-        error); or any
-        `pymc_statespace_filters.evidence.estimators.Estimator`, built-in with other settings or
-        your own.
+        few independent ones, or with `filter`, "importance", the only one that does not average
+        the draws. Names among "chib_jeliazkov", "bridge" (bridge sampling to a normal distribution)
+        and "importance" (importance sampling from a mixture of Student-t distributions, for several
+        modes); or any `pymc_statespace_filters.evidence.estimators.Estimator`, built-in with other
+        settings or your own.
     target_se : float
-        Standard error, in nats, at which an estimator stops evaluating. "chib_jeliazkov", "bridge",
-        "warp_bridge", "importance" and "prior_monte_carlo" begin with about 1000 evaluations and
-        double them as long as this helps, up to at most 20 000 (three times as many with
-        "warp_bridge"). An `Estimator` with its own ``target_se`` or ``n_proposals`` keeps it. The
-        part of the error that is due to the draws is reduced by more draws alone.
+        Standard error, in nats, at which an estimator stops evaluating. The built-in ones begin
+        with about 1000 evaluations and double them as long as this helps, up to at most 20 000. An
+        `Estimator` with its own ``target_se`` or ``n_proposals`` keeps it. The part of the error
+        that is due to the draws is reduced by more draws alone.
     random_seed : int or numpy.random.Generator, optional
         Seed. Each estimator gets its own stream, independent of which others run.
     extend_inferencedata : bool
@@ -256,11 +245,9 @@ def estimate_evidence(
     Raises
     ------
     ModelError
-        If an estimator is unknown, `target_se` is not positive, `filter` is biased or that of the
-        model, or no estimator can treat the model: "laplace" needs a deterministic likelihood and a
-        mode inside the support,
-        "tempered_smc" and "prior_monte_carlo" a prior that can be sampled. Further as
-        `chib_jeliazkov`.
+        If an estimator is unknown or cannot treat the model, `target_se` is not positive, `filter`
+        is biased or that of the model, or an estimator would average draws that only say where the
+        posterior lies. Further as `chib_jeliazkov`.
     DataMismatchError, TypeError
         As `chib_jeliazkov`.
 
@@ -269,16 +256,15 @@ def estimate_evidence(
     EvidenceWarning
         If the estimate that `compare_evidence` takes by default ("bridge", if it is made) may be
         unreliable, or its standard error stays above `target_se`, with the number of draws that
-        would do or another remedy; doubts about the others are in the result. If an estimator
-        cannot treat the model and is missing from the result; or if the estimates disagree, with
-        p < 0.001 by Cochran's chi-square test and by more than 0.05 nats. The warning states the
-        likely cause.
+        would do or another remedy; doubts about the others are in the result. Or if the estimates
+        disagree, with p < 0.001 by Cochran's chi-square test and by more than 0.05 nats. The
+        warning states the likely cause.
 
     Notes
     -----
-    "chib_jeliazkov", "bridge" and "warp_bridge" use the same evaluations of the normal
-    distributions that they fit to the halves of the draws: the first to choose its proposals, the
-    other two in their estimates. No estimate depends on which others are made.
+    "chib_jeliazkov" and "bridge" use the same evaluations of the normal distributions that they fit
+    to the halves of the draws: the first to choose its proposals, the other in its estimate. No
+    estimate depends on which others are made.
 
     With `filter`, the mean of prior times estimated likelihood over the density of the proposals is
     unbiased, and the noise of the estimates is part of the standard error (Tran, Scharth, Pitt and
@@ -312,8 +298,6 @@ def estimate_evidence(
         is_fit_enough = filter is not None or are_populations(idata)
         estimators = "importance" if is_fit_enough else DEFAULT
     selected = _select_estimators(estimators, check_positive("target_se", target_se))
-    if filter is not None:
-        _check_guided(selected)
     with cores_set_to(_checked_cores(cores)), COMPILATION:
         estimates = run_estimators(
             idata,
@@ -349,6 +333,8 @@ def _select_estimators(
     entries = [given] if isinstance(given, str | Estimator) else list(given)
     found: dict[str, Estimator] = {}
     for entry in entries:
+        if isinstance(entry, str) and entry in _INSTEAD:
+            raise ModelError(f"the estimator {entry!r} has gone: use {_INSTEAD[entry]}")
         estimator = ESTIMATORS.get(entry) if isinstance(entry, str) else entry
         if not isinstance(estimator, Estimator):
             raise ModelError(
@@ -362,15 +348,6 @@ def _select_estimators(
     if not found:
         raise ModelError(f"estimators must have at least one of {list(ESTIMATORS)}, got {given!r}")
     return [_with_target(estimator, target_se) for estimator in found.values()]
-
-
-def _check_guided(estimators: Iterable[Estimator]) -> None:
-    """Raise unless the estimators take the draws for no more than a guide."""
-    if refused := [e.name for e in estimators if uses_draws(e) and not isinstance(e, Importance)]:
-        raise ModelError(
-            "estimators must be among 'importance', 'tempered_smc' and 'prior_monte_carlo' with "
-            f"filter=, got {refused}, for which the draws must be those of the exact posterior"
-        )
 
 
 def _with_target(estimator: Estimator, target_se: float) -> Estimator:

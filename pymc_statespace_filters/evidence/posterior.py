@@ -3,22 +3,14 @@
 Log-densities on the unconstrained space include the Jacobians of the transforms.
 """
 
-from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DataMismatchError, ModelError
-from ..filters.outcomes import Failure, why_zero
-from ..importance import LogMean, log_mean_of_draws, mcse
-
-N_EXPLAINED = 100  # points of zero likelihood at which the reason is looked for
-LEAST_POPULATIONS = 4  # two in each half, whose spread is its error
-LEAST_SHARE = 0.02  # of the draws, for a population to count
-LEAST_HALF = 0.25  # of the draws
+from ..errors import DataMismatchError
 
 Array = NDArray[np.float64]
 
@@ -49,8 +41,6 @@ class Posterior:
         likelihood takes fresh noise from `rng` for each point.
     is_noisy : bool
         Whether repeated evaluations at one point differ.
-    failures : callable, optional
-        ``failures(x)`` counts why the likelihood is zero at points x (m, k).
     prior : Prior, optional
         The likelihood is the log-density of `evaluate` minus that of the prior.
     population : ndarray of int (chain, draw), optional
@@ -70,7 +60,6 @@ class Posterior:
     evaluate: Callable[[Array, np.random.Generator], Array]
     is_noisy: bool = False
     prior: Prior | None = None
-    failures: Callable[[Array], Counter[Failure]] | None = None
     population: NDArray[np.int64] | None = None
     remedy: str = "use bridge sampling"
     shared_seed: tuple[int, ...] | None = None
@@ -90,84 +79,16 @@ class Posterior:
         log_prior = self.required_prior.log_density(x)
         return log_prior, log_likelihood_of(self.evaluate(x, rng), log_prior)
 
-    def worst_disagreement(self, found: Iterable[str]) -> list[str]:
-        """The worst of what chains disagree about, if they are chains; those that agree are ""."""
-        if self.population is not None:
-            return []
-        return sorted({one for one in found if one})[-1:]
-
-    def mcse(self, terms: Array) -> float:
-        """Standard error of the mean of terms (chain, draw), one of each draw."""
-        return mcse(terms, self.population)
-
-    def ess(self, terms: Array) -> float:
-        """How many independent draws the mean of terms (chain, draw) is worth, at least one."""
-        if self.population is not None:
-            error = self.mcse(terms)
-            return max(1.0, float(terms.var()) / error**2) if error > 0 else float(terms.size)
-        from arviz_stats import ess  # loads much: see `importance`
-
-        return float(ess(terms, method="mean"))
-
-    def log_mean(self, log_terms: Array) -> LogMean:
-        """Log of the mean of positive terms (chain, draw), one of each draw, with its error."""
-        return log_mean_of_draws(log_terms, self.population)
-
-    def why_zero(self, x: Array) -> str:
-        """Why the likelihood is zero at most of some prior draws x (m, k), and what to do."""
-        x = x[:N_EXPLAINED]
-        return why_zero(Counter() if self.failures is None else self.failures(x), len(x))
-
     def halves(self) -> tuple["Posterior", "Posterior"]:
-        """Split every chain into its first and second half; of populations, half of these.
-
-        Each half can be averaged, with an error of its own.
-
-        Raises
-        ------
-        ModelError
-            If fewer than four populations have a fiftieth of the draws or more, or one decides,
-            so that either half has less than a quarter of the draws.
-        """
-        if self.population is not None:
-            return self._halves_of_populations(self.population)
-        return self._halves_of_chains()
-
-    def halves_for_fit(self) -> tuple["Posterior", "Posterior"]:
-        """Split every chain into its first and second half; of populations, every second draw.
-
-        A fit to one half is compared with the other. Nothing is averaged, so that one population
-        is enough.
-        """
-        if self.population is not None:
-            return self.at(np.s_[:, ::2]), self.at(np.s_[:, 1::2])
-        return self._halves_of_chains()
-
-    def _halves_of_chains(self) -> tuple["Posterior", "Posterior"]:
+        """Split every chain into its first and second half; each has an error of its own."""
         middle = self.draws.shape[1] // 2
         return self.at(np.s_[:, :middle]), self.at(np.s_[:, middle:])
 
-    def _halves_of_populations(
-        self, population: NDArray[np.int64]
-    ) -> tuple["Posterior", "Posterior"]:
-        """The populations dealt out in the order of their sizes, each half as one chain."""
-        labels, sizes = np.unique(population, return_counts=True)
-        order = labels[np.argsort(-sizes, kind="stable")]
-        is_first = np.isin(population, [*order[::4], *order[3::4]])
-        n_counting = int((sizes >= LEAST_SHARE * population.size).sum())
-        share = min(is_first.mean(), 1 - is_first.mean())
-        if n_counting < LEAST_POPULATIONS or share < LEAST_HALF:
-            raise ModelError(
-                f"the draws of idata must be of at least {LEAST_POPULATIONS} populations, none of "
-                f"which decides alone, to be averaged, got {n_counting} with {LEAST_SHARE:.0%} of "
-                f"the draws or more, and {sizes.max() / population.size:.0%} in the largest: use "
-                'estimate_evidence with estimators="importance", or raise draws or populations of '
-                "sample_smc"
-            )
-        first, second = (np.nonzero(mask) for mask in (is_first, ~is_first))
-        return self.at(tuple(one[None] for one in first)), self.at(
-            tuple(one[None] for one in second)
-        )
+    def halves_for_fit(self) -> tuple["Posterior", "Posterior"]:
+        """The same, and of populations every second draw: a fit to one is tried on the other."""
+        if self.population is None:
+            return self.halves()
+        return self.at(np.s_[:, ::2]), self.at(np.s_[:, 1::2])
 
     def thinned(self, most: int) -> "Posterior":
         """Thin every chain evenly, so that about `most` draws remain in all, or fewer."""

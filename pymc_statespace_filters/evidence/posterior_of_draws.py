@@ -1,14 +1,11 @@
 """The posterior of a DataTree: its draws, and the log-densities and noise seeds beside them."""
 
-from functools import partial
-
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from ..errors import DataMismatchError, ModelError
 from ..pymc_model.density import ModelDensity
-from ..pymc_model.filter_estimates import failures_at
 from ..pymc_model.posterior_draws import check_one_model, populations_of, unconstrained_draws
 from ..pymc_model.prior import ModelPrior
 from ..pymc_model.stored_density import (
@@ -73,8 +70,7 @@ def build_posterior(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterio
         return density.evaluate(x, rng.integers(np.iinfo(np.int64).max, size=size))
 
     prior = ModelPrior(density.model)
-    failures = partial(failures_at, density.model)
-    facts = not held, prior, failures, populations_of(idata)
+    facts = not held, prior, populations_of(idata)
     return Posterior(draws, log_density, evaluate, *facts), noise
 
 

@@ -29,8 +29,9 @@ from ..pymc_model.prior import Support
 from ..unvisited.sentences import stored, unvisited
 from .agreement import chosen_estimator
 from .checks import check_convergence, check_discretisation
+from .estimators.importance import Importance
 from .estimators.maximum_likelihood import N_EVALUATIONS, max_log_likelihood
-from .estimators.protocol import Estimate, Estimator, uses_draws
+from .estimators.protocol import Estimate, Estimator
 from .evidence import Evidence, store_evidence
 from .exact_density import ExactDensity
 from .exchangeable_labels import exchangeable_labels, uncounted_orders
@@ -69,10 +70,15 @@ def run_estimators(
     Warns
     -----
     EvidenceWarning
-        Once for all problems that do not depend on the estimator; once if the chains disagree, and
-        once if the error is doubtful or too large, both of the estimate that is taken; and once for
-        each estimator that cannot treat the model while another can.
+        Once for all problems that do not depend on the estimator, and once if the error of the
+        estimate that is taken is doubtful or too large.
+
+    Raises
+    ------
+    ModelError
+        If estimators average the draws where these may only say where the posterior lies.
     """
+    _check_guided(estimators, idata, filter)
     model = model_of_draws(model, idata)
     began = time.process_time()
     posterior_group(idata)  # fails early, before anything is compiled
@@ -91,13 +97,13 @@ def run_estimators(
         *support.check(),
         *check_discretisation(model, idata, posterior.draws),
         *(stored_filter_checks(idata, model, OFF) if exact is None else ()),
-    )
-    of_chains = (
         *check_convergence(posterior, idata),
         *uncounted_orders(model, labels),
         *_missed(idata, model, posterior, stream(UNVISITED)),
     )
     posterior = replace(posterior, shared_seed=(*entropy, crc32(SHARED.encode())))
+    if are_populations(idata):
+        posterior = replace(posterior, remedy="take the evidence that sample_smc has stored")
     with row_progress(exact or density.calls, enabled=progressbar) as announce:
         if exact is not None:
             noise = "refreshed" if exact.n_noisy else "none"
@@ -106,20 +112,19 @@ def run_estimators(
             off = _doubts_of_filter(exact, posterior, seconds, stream(FILTER))
             common, remedy = (*common, *off), _remedy(exact.filter, is_off=bool(off))
             posterior = replace(posterior, remedy=remedy)
-        estimates, refusals = _estimates(estimators, posterior, stream, announce)
+        estimates = _estimates(estimators, posterior, stream, announce)
         announce(MAXIMUM, N_EVALUATIONS)
         rng = stream(MAXIMUM)
         largest = max_log_likelihood(posterior, rng)
         if exact is None:
-            estimates = _where_reached(estimates, estimators, posterior, largest.point, rng)
+            estimates = _where_reached(estimates, posterior, largest.point, rng)
 
-    rest_on_draws = [one.name for one in estimators if one.name in estimates and uses_draws(one)]
     of_model = _model_fields(model, posterior, support)
     of_model |= {"max_log_likelihood": largest.log_likelihood, "noise": noise}
     of_model["approximate"] = not (exactness(model) if exact is None else exact.is_exact)
     found = {}
     for name, estimate in estimates.items():
-        doubts = (*common, *(of_chains if name in rest_on_draws else ()), *estimate.doubts)
+        doubts = (*common, *estimate.doubts)
         numbers = estimate.log_evidence, estimate.se
         found[name] = Evidence(*numbers, name, doubts="; ".join(doubts), **of_model)
         if extend_inferencedata:
@@ -127,11 +132,6 @@ def run_estimators(
     # The others check the one that is taken: what is doubtful about them is in the result alone.
     taken = chosen_estimator(found)
     _warn(LESS_CERTAIN.format("the log-evidence"), common)
-    if taken in rest_on_draws:
-        of_which = f"the log-evidence from draws ({', '.join(rest_on_draws)})"
-        _warn(LESS_CERTAIN.format(of_which), of_chains)
-    for name, refusal in refusals.items():
-        _warn(f"no estimate by {name}", [str(refusal)])
     by_name = {one.name: one for one in estimators}
     _warn(*_problem(by_name[taken], estimates[taken]))
     return found
@@ -172,24 +172,18 @@ def _remedy(filter: Filter, *, is_off: bool) -> str:
 
 def _where_reached(
     estimates: dict[str, Estimate],
-    estimators: Sequence[Estimator],
     posterior: Posterior,
     peak: NDArray[np.float64],
     rng: np.random.Generator,
 ) -> dict[str, Estimate]:
     """Estimates without an error, and with a doubt, if their draws never reached the posterior."""
-    from_draws = {one.name for one in estimators if uses_draws(one)} & estimates.keys()
-    if not from_draws:
-        return estimates
-    largest = max(estimates[name].log_evidence for name in from_draws)
+    largest = max(one.log_evidence for one in estimates.values())
     reason = check_reached(posterior, peak, largest, rng)
     if not reason:
         return estimates
-    return estimates | {
-        name: replace(
-            estimates[name], se=math.nan, doubts=(reason, *estimates[name].doubts), shortfall=""
-        )
-        for name in from_draws
+    return {
+        name: replace(one, se=math.nan, doubts=(reason, *one.doubts), shortfall="")
+        for name, one in estimates.items()
     }
 
 
@@ -217,15 +211,32 @@ def _model_fields(model: pm.Model, posterior: Posterior, support: Support) -> di
     }
 
 
+def _check_guided(
+    estimators: Sequence[Estimator], idata: xr.DataTree, filter: Filter | None
+) -> None:
+    """Raise if draws that only say where the posterior lies would be averaged.
+
+    Those of chains at another filter are of another posterior, and the populations of `sample_smc`
+    are few independent draws.
+    """
+    if filter is None and not are_populations(idata):
+        return
+    if refused := [one.name for one in estimators if not isinstance(one, Importance)]:
+        raise ModelError(
+            "estimators must be 'importance' with filter= or draws of sample_smc, which only say "
+            f"where the posterior lies, got {refused}, for which the draws must be those of chains "
+            "at this posterior"
+        )
+
+
 def _estimates(
     estimators: Sequence[Estimator],
     posterior: Posterior,
     stream: Callable[[str], np.random.Generator],
     announce: Callable[[str, int], None],
-) -> tuple[dict[str, Estimate], dict[str, ModelError]]:
-    """Run the estimators in turn; raise only if none of them can treat the model."""
-    estimates: dict[str, Estimate] = {}
-    refusals: dict[str, ModelError] = {}
+) -> dict[str, Estimate]:
+    """Run the estimators in turn."""
+    estimates = {}
     for estimator in estimators:
         name = estimator.name
         announce(name, estimator.n_evaluations(posterior))
@@ -233,10 +244,8 @@ def _estimates(
             estimates[name] = estimator.estimate(posterior, rng=stream(name))
         except ModelError as error:
             error.add_note(f"raised by the estimator {name!r}")
-            refusals[name] = error
-    if not estimates:
-        raise next(iter(refusals.values()))
-    return estimates, refusals
+            raise
+    return estimates
 
 
 def _warn(message: str, reasons: Sequence[str]) -> None:

@@ -86,14 +86,11 @@ class Case:
         The target with its draws, made when it is first asked for.
     n_parameters : int
     n_runs : int
-    is_noisy : bool
     """
 
     make: Callable[[], Any]
     n_parameters: int
     n_runs: int = 200
-    is_noisy: bool = False
-    has_curvature: bool = True
 
     @property
     def source(self):
@@ -125,8 +122,7 @@ def pseudo_marginal_double_well():
 
 
 def _hard(make, k):
-    has_curvature = make not in (Skewed, Funnel, Bent)
-    return Case(lambda: Drawn(make(k), 2500), k, 20, has_curvature=has_curvature)
+    return Case(lambda: Drawn(make(k), 2500), k, 20)
 
 
 CASES = {
@@ -151,10 +147,10 @@ CASES = {
         }.items()
         for k in (8, 11)
     },
-    "noisy regression, 4": Case(lambda: Drawn(regression(4), 1000, noise_sd=1.0), 4, is_noisy=True),
+    "noisy regression, 4": Case(lambda: Drawn(regression(4), 1000, noise_sd=1.0), 4),
     "state space, EKF": Case(lambda: Drawn(state_space(), 1000), 2, 20),
-    "state space, BootstrapPF": Case(pseudo_marginal, 2, 20, is_noisy=True),
-    "double well, BootstrapPF": Case(pseudo_marginal_double_well, 2, 20, is_noisy=True),
+    "state space, BootstrapPF": Case(pseudo_marginal, 2, 20),
+    "double well, BootstrapPF": Case(pseudo_marginal_double_well, 2, 20),
 }
 
 
@@ -273,19 +269,8 @@ def _counted(posterior):
 
 def applies(estimator, case):
     """Whether an estimator is asked for the evidence of a target."""
-    if estimator == "laplace":  # needs a curvature
-        return case.has_curvature and not case.is_noisy
     if estimator == IN_BLOCKS:  # is for many parameters
         return case.n_parameters >= 12 and case in CASES.values()
     if estimator in STOPPED:
         return case in CASES.values()
-    if estimator == "prior_monte_carlo":  # is for few parameters
-        return case.n_parameters <= 4 and case in CASES.values()
-    if estimator == "tempered_smc":  # takes as many evaluations however long the chains
-        return case in CASES.values() and case is not CASES["double well, BootstrapPF"]
     return True
-
-
-def replications(estimator, case):
-    """How many: fewer where each takes seconds."""
-    return 20 if estimator == "tempered_smc" and case.n_parameters > 12 else case.n_runs

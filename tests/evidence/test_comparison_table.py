@@ -65,14 +65,14 @@ def test_a_warning_is_said_with_its_models():
         {
             "a": evidence(-8, doubts=disagree),
             "b": evidence(-19, doubts=disagree),
-            "c": evidence(-29, se=math.nan, estimator="laplace"),
+            "c": evidence(-29, se=math.nan, estimator="rough"),
             "d": evidence(-39, noise="held"),
         }
     )
     warnings = [text for text in said_of if text.startswith("Warning")]
     assert warnings == [
         "Warning for 'a' and 'b' (bridge): the chains disagree (R-hat 1.31).",
-        "Warning for 'c' (laplace): the estimate has no standard error, so that no interval is "
+        "Warning for 'c' (rough): the estimate has no standard error, so that no interval is "
         "known.",
         "Warning for 'd' (bridge): the chains held one noise seed, and se excludes the error of "
         "the filter.",
@@ -160,7 +160,7 @@ def test_bridge_is_the_estimate_and_the_others_check_it():
     }
     assert list(compare_evidence(rivals)["log_evidence"]) == [-8, -9]
     assert said(rivals)[0] == "Log-evidences by bridge."
-    with_one = rivals | {"c": evidence(-20, estimator="laplace")}
+    with_one = rivals | {"c": evidence(-20, estimator="rough")}
     assert said(with_one)[0] == "Log-evidences of 'a', 'b' by bridge."
     # An error about which there are doubts is not the smallest, but for that of the check.
     for name in rivals:
@@ -170,21 +170,21 @@ def test_bridge_is_the_estimate_and_the_others_check_it():
 
 
 def test_an_estimate_without_an_error_is_neither_tested_nor_taken_if_there_is_another():
-    rivals = {"a": several(-8, laplace=(-3.0, math.nan), chib_jeliazkov=(0.0, 0.01))}
+    rivals = {"a": several(-8, rough=(-3.0, math.nan), chib_jeliazkov=(0.0, 0.01))}
     assert list(compare_evidence(rivals)["log_evidence"]) == [-8]
-    unknown = {"a": several(-8, laplace=(0.0, math.nan), mine=(0.0, math.nan))}
+    unknown = {"a": several(-8, rough=(0.0, math.nan), mine=(0.0, math.nan))}
     with pytest.raises(ModelError, match=r"'a' has .* none of them with a standard error: .*mine"):
         compare_evidence(unknown)
 
 
 def test_estimates_that_disagree_are_a_warning_with_the_cause():
-    rivals = {"a": evidence(-9), "b": several(-8, bridge=(-2.0, 0.01), tempered_smc=(0.0, 0.01))}
+    rivals = {"a": evidence(-9), "b": several(-8, bridge=(-2.0, 0.01), importance=(0.0, 0.01))}
     table = compare_evidence(rivals)
     assert table["log_evidence"].to_dict() == {"a": -9, "b": -10}
     assert table["warning"].to_dict() == {"a": False, "b": True}
     assert said(rivals)[1].startswith(
-        "Warning for 'b' (bridge): tempered_smc is 2.00 above bridge; the chains have probably not "
-        "visited all of the posterior"
+        "Warning for 'b' (bridge): importance is 2.00 above bridge; the draws are too few, or the "
+        "posterior is far from the shape"
     )
     # One that is doubtful itself says little about the other.
     rivals["b"] = several(-10, bridge=(0.0, 0.2), chib_jeliazkov=(4.6, 0.9))

@@ -5,7 +5,7 @@ import pytest
 import pymc_statespace_filters as psf
 from tests.evidence import double_well
 
-ESTIMATORS = ["chib_jeliazkov", "bridge", "warp_bridge", "importance"]
+ESTIMATORS = ["chib_jeliazkov", "bridge", "importance"]
 # What `suggest_particles` suggests: a log-likelihood of variance two, between 1 and 3.3.
 N_PARTICLES = 50
 

@@ -11,19 +11,14 @@ import pytest
 import xarray as xr
 from scipy.stats import norm
 
-from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence import estimation, runner
 from pymc_statespace_filters.evidence.comparison.scaled_prior import average_ratios
-from pymc_statespace_filters.evidence.estimators.block_ordinates import estimate_in_blocks
-from pymc_statespace_filters.evidence.estimators.bridge import Bridge
-from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
-from pymc_statespace_filters.evidence.estimators.laplace import Laplace
-from pymc_statespace_filters.evidence.estimators.random_walk_proposal import Proposal
 from pymc_statespace_filters.evidence.pooled import Pooled
 from pymc_statespace_filters.evidence.posterior import Posterior
 from pymc_statespace_filters.evidence.reweighting.correction import correct
 from pymc_statespace_filters.evidence.shorter_steps import _changes
-from pymc_statespace_filters.importance import mcse_of_populations
+from pymc_statespace_filters.importance import mcse, mcse_of_populations
 from pymc_statespace_filters.pymc_model.posterior_draws import BY_PARTICLES, populations_of
 from tests.evidence.targets import Regression
 from tests.waiting import LIMIT
@@ -44,46 +39,6 @@ def particles(rng):
     return Posterior(
         x, log_density(x), lambda x, rng: log_density(x), population=population.reshape(4, -1)
     )
-
-
-@pytest.mark.parametrize("estimator", [Bridge(), Bridge(warped=True), ChibJeliazkov()])
-def test_errors_are_those_of_few_independent_populations(estimator):
-    """Each error is known to a fifth or so; the mean square of 60 z is below 2 nearly always."""
-    rng, z = np.random.default_rng(3), []
-    for _ in range(60):
-        found = estimator.estimate(particles(rng), rng=rng)
-        z.append(found.log_evidence / found.se)
-    assert 0.3 < np.mean(np.square(z)) < 2.0
-
-
-def test_halves_have_no_population_in_common():
-    posterior = particles(np.random.default_rng(1))
-    halves = posterior.halves()
-    labels = [set(np.unique(half.population)) for half in halves]
-    assert not labels[0] & labels[1]
-    assert labels[0] | labels[1] == set(range(R))
-    sizes = [half.log_density.size for half in halves]
-    assert sum(sizes) == R * N
-    assert min(sizes) > 0.4 * R * N
-    for half in halves:
-        np.testing.assert_array_equal(half.log_density, log_density(half.draws))
-    thinned = posterior.thinned(80)
-    assert thinned.population.shape == thinned.log_density.shape == (4, 20)
-
-
-def test_the_error_of_blocks_is_that_of_populations():
-    """Populations of different widths in turn, which in chains would cancel."""
-    population = np.broadcast_to(np.arange(800) % 4, (1, 800))
-    widths = np.array([0.5, 0.8, 1.1, 1.4])[population]
-    x = widths[..., None] * np.random.default_rng(6).standard_normal((1, 800, 2))
-    posterior = Posterior(x, log_density(x), lambda x, rng: log_density(x), population=population)
-    proposal = Proposal(np.zeros(2), log_density(np.zeros(2)), np.eye(2))
-    of_chain, of_populations = (
-        estimate_in_blocks(proposal, one, n_blocks=2, n_proposals=800, rng=np.random.default_rng(7))
-        for one in (replace(posterior, population=None), posterior)
-    )
-    assert of_populations.log_evidence == of_chain.log_evidence
-    assert of_populations.se > 3 * of_chain.se
 
 
 def in_turn(scatter):
@@ -133,32 +88,8 @@ def test_weighted_draws_keep_their_populations():
     assert found.pooled.shape == (4, 100)
 
 
-@pytest.mark.parametrize("is_labelled", [False, True])
-def test_the_depth_of_populations_has_their_error(is_labelled):
-    """Populations of several widths, in turn, are too deep on average for draws of chains."""
-    population = np.broadcast_to(np.arange(800) % 4, (1, 800))
-    widths = np.array([0.7, 1.0, 1.4, 1.9])[population]
-    x = widths[..., None] * np.random.default_rng(6).standard_normal((1, 800, 2))
-    posterior = Posterior(
-        x,
-        log_density(x),
-        lambda x, rng: log_density(x),
-        population=population if is_labelled else None,
-    )
-    doubts = Laplace().estimate(posterior, rng=np.random.default_rng(1)).doubts
-    assert any("nats below the mode" in one for one in doubts) is not is_labelled
-
-
-def of_sizes(sizes):
-    """Independent draws of N(0, 1) in 4 chains, of populations of given sizes, of sum 800."""
-    x = np.random.default_rng(4).standard_normal((4, 200, 2))
-    population = np.repeat(np.arange(len(sizes)), sizes).reshape(4, 200)
-    return Posterior(x, log_density(x), lambda x, rng: log_density(x), population=population)
-
-
 def test_draws_of_one_population_have_no_error():
-    alone = of_sizes([800])
-    assert np.isinf(alone.mcse(alone.log_density))
+    assert np.isinf(mcse(np.arange(8.0).reshape(2, 4), np.zeros((2, 4), dtype=int)))
 
 
 def test_halves_for_a_fit_are_of_all_populations():
@@ -169,35 +100,6 @@ def test_halves_for_a_fit_are_of_all_populations():
     chains = replace(posterior, population=None)
     for one, other in zip(chains.halves_for_fit(), chains.halves(), strict=True):
         np.testing.assert_array_equal(one.draws, other.draws)
-
-
-@pytest.mark.parametrize(
-    ("sizes", "found"),
-    [
-        ([400, 380, 20], "got 3 with 2% of the draws or more, and 50% in the largest"),
-        ([400, 380, 16, 4], "got 3 with 2% of the draws or more"),
-        ([720, 20, 20, 20, 20], "got 5 with 2% of the draws or more, and 90% in the largest"),
-    ],
-)
-@pytest.mark.parametrize("estimator", [Bridge(), Bridge(warped=True), ChibJeliazkov()])
-def test_few_populations_are_not_averaged(estimator, sizes, found):
-    with pytest.raises(ModelError, match=found):
-        estimator.estimate(of_sizes(sizes), rng=np.random.default_rng(1))
-
-
-@pytest.mark.parametrize("sizes", [[400, 360, 20, 20], [500, 140, 80, 80]])
-@pytest.mark.parametrize(
-    "estimator",
-    [
-        Bridge(target_se=0.05),
-        Bridge(True, 0.05),
-        ChibJeliazkov(target_se=0.05),
-        ChibJeliazkov(100, n_blocks=2),
-    ],
-)
-def test_four_unequal_populations_are(estimator, sizes):
-    found = estimator.estimate(of_sizes(sizes), rng=np.random.default_rng(5))
-    assert abs(found.log_evidence) < 4 * found.se < np.inf
 
 
 class TestModel:
@@ -221,13 +123,16 @@ class TestModel:
         found = estimation.estimate_evidence(self.idata(1), model, random_seed=1)["importance"]
         assert abs(found.log_evidence - (-4.6154)) < 4 * found.se < 0.2
 
-    @pytest.mark.parametrize("n_populations", [1, 2, 3])
-    def test_others_refuse_fewer_than_four(self, model, n_populations):
-        idata, advice = self.idata(n_populations), 'estimate_evidence with estimators="importance"'
-        with pytest.raises(ModelError, match=f"got {n_populations} with .*{advice}"):
-            estimation.estimate_evidence(idata, model, estimators="bridge")
-        with pytest.raises(ModelError, match=f"got {n_populations} with .*{advice}"):
+    def test_no_other_takes_them(self, model):
+        idata, message = self.idata(8), r"must be 'importance' .* sample_smc, .*, got \['{}'\]"
+        with pytest.raises(ModelError, match=message.format("bridge")):
+            estimation.estimate_evidence(idata, model, estimators=["importance", "bridge"])
+        with pytest.raises(ModelError, match=message.format("chib_jeliazkov")):
             estimation.chib_jeliazkov(idata, model)
+
+    def test_a_poor_fit_is_not_sent_to_an_estimator_that_refuses_them(self, model):
+        with model, pytest.warns(EvidenceWarning, match="the evidence that sample_smc has stored"):
+            estimation.estimate_evidence(self.idata(8), target_se=1e-4, random_seed=1)
 
 
 def test_importing_posteriors_leaves_the_statistics_of_arviz_alone():

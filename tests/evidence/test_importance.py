@@ -7,7 +7,6 @@ import pytest
 
 from pymc_statespace_filters.errors import DataMismatchError
 from pymc_statespace_filters.evidence.estimators.importance import Importance
-from pymc_statespace_filters.evidence.estimators.prior_monte_carlo import PriorMonteCarlo
 from pymc_statespace_filters.importance import pareto_k
 from tests.evidence.analytic import gaussian, half_normal
 from tests.evidence.calibration import EACH_NUMBER_OF_RUNS, check_scores
@@ -144,8 +143,7 @@ def test_no_density_where_the_draws_are():
         Importance().estimate(posterior, rng=rng)
 
 
-@pytest.mark.parametrize("estimator", [Importance(target_se=0.01), PriorMonteCarlo(target_se=0.01)])
-def test_no_more_is_evaluated_where_few_terms_stay_few(estimator):
+def test_no_more_is_evaluated_where_few_terms_stay_few():
     """Noise of variance 30: of any number of estimates a few decide."""
     rng, seen = np.random.default_rng(58), []
     posterior = Regression(2, 20, rng).posterior((4, 500), rng, noise_sd=30**0.5)
@@ -154,9 +152,8 @@ def test_no_more_is_evaluated_where_few_terms_stay_few(estimator):
         seen.append(len(x))
         return posterior.evaluate(x, rng)
 
-    found = estimator.estimate(replace(posterior, evaluate=evaluate), rng=rng)
-    (n_effective,) = (v for k, v in found.settings.items() if k.startswith("n_effective"))
-    assert n_effective < 10
+    found = Importance(target_se=0.01).estimate(replace(posterior, evaluate=evaluate), rng=rng)
+    assert found.settings["n_effective_proposals"] < 10
     assert sum(seen) < 8000
     assert found.doubts
     assert found.shortfall

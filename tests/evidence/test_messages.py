@@ -15,8 +15,6 @@ from pymc_statespace_filters.evidence import Evidence, compare_evidence
 from pymc_statespace_filters.evidence.estimators.bridge import Bridge
 from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
 from pymc_statespace_filters.evidence.estimators.importance import Importance
-from pymc_statespace_filters.evidence.estimators.prior_monte_carlo import PriorMonteCarlo
-from pymc_statespace_filters.evidence.estimators.tempered_smc import TemperedSMC
 
 EVIDENCE = Evidence(-8.0, 0.05, "chib_jeliazkov", 2, 21, -5.0, "same")
 RIVALS = {"a": EVIDENCE, "b": replace(EVIDENCE, log_evidence=-9.0)}
@@ -77,15 +75,10 @@ TABLE = [
     ),
     *each(chib, "n_proposals", [10, 500.0, "many"], "n_proposals must be an integer of at least 1"),
     *each(ChibJeliazkov, "n_blocks", [0, 1.5, True], "n_blocks must be an integer of at least 1"),
-    *each(PriorMonteCarlo, "n_draws", [99, 1e4, None], "n_draws must be an integer of at least"),
-    *each(TemperedSMC, "n_particles", [49, 1e3], "n_particles must be an integer of at least 50"),
-    *each(TemperedSMC, "n_runs", [6, 9], "n_runs must be an even integer of at least 8"),
     *each(estimate, "target_se", [*NOT_POSITIVE, None], "target_se must be a positive number"),
     *(
         row
-        for make in (
-            ChibJeliazkov, Bridge, partial(Bridge, warped=True), Importance, PriorMonteCarlo
-        )
+        for make in (ChibJeliazkov, Bridge, Importance)
         for row in each(make, "target_se", NOT_POSITIVE, "target_se must be a positive number")
     ),
     (estimate, "estimators", [], r"estimators must have at least one of \['chib_j.*got \[\]"),
@@ -94,6 +87,18 @@ TABLE = [
         "estimators",
         ["bridge", "harmonic_mean"],
         r"names among \['chib_j.* objects, got 'harmonic_mean'",
+    ),
+    *each(
+        estimate,
+        "estimators",
+        ["prior_monte_carlo", ["bridge", "tempered_smc"]],
+        "the estimator '.*' has gone: use the evidence of sample_smc, which needs no draws",
+    ),
+    *each(
+        estimate,
+        "estimators",
+        ["laplace", "warp_bridge"],
+        "the estimator '.*' has gone: use 'bridge'",
     ),
     (estimate, "estimators", 3, "or Estimator objects, got 3"),
     (estimate, "estimators", ["bridge", 3], "or Estimator objects, got 3"),

@@ -167,22 +167,6 @@ def test_chains_that_disagree_are_a_warning(regression_model):
         chib_jeliazkov(idata, regression_model, random_seed=1)
 
 
-def test_only_estimates_from_draws_are_told_that_chains_disagree(regression_model, recwarn):
-    idata = exact_draws((2, 1000))
-    idata["posterior"]["w"][0, :, -1] += 0.1
-    alone = estimate_evidence(
-        idata, regression_model, estimators=("tempered_smc", "laplace"), random_seed=1
-    )
-    assert not any("chains disagree" in str(one.message) for one in recwarn)
-    assert not any("chains disagree" in one.doubts for one in alone.values())
-    with pytest.warns(EvidenceWarning, match=r"from draws \(bridge\) .* the chains disagree \(R-"):
-        beside = estimate_evidence(
-            idata, regression_model, estimators=("bridge", "laplace"), random_seed=1
-        )
-    assert "chains disagree" in beside["bridge"].doubts
-    assert beside["laplace"].log_evidence == alone["laplace"].log_evidence
-
-
 @pytest.mark.parametrize("exact", [True, False])
 def test_the_evidence_tells_whether_the_likelihood_is_exact(regression_model, monkeypatch, exact):
     """Which filters are exact for which systems is tested with the filters."""

@@ -10,19 +10,17 @@ from pymc_statespace_filters.errors import EvidenceWarning
 from pymc_statespace_filters.evidence.estimators.bridge import Bridge
 from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
 from pymc_statespace_filters.evidence.estimators.importance import Importance
-from pymc_statespace_filters.evidence.estimators.prior_monte_carlo import PriorMonteCarlo
 from pymc_statespace_filters.evidence.estimators.stopping import FEWEST, MOST, shortfall
 from pymc_statespace_filters.evidence.estimators.whitening import BLOCK, normal_proposals
 from tests.evidence.analytic import gaussian
 from tests.evidence.calibration import EACH_NUMBER_OF_RUNS, check_scores
-from tests.evidence.targets import Regression, TwoModes
+from tests.evidence.targets import Regression
 from tests.evidence.test_models import REGRESSION, exact_draws
 
 LOG_EVIDENCE = -3.7  # of `gaussian`
 WITH_TARGET = {
     "chib_jeliazkov": ChibJeliazkov,
     "bridge": Bridge,
-    "warp_bridge": lambda **settings: Bridge(warped=True, **settings),
     "importance": Importance,
 }
 EACH = pytest.mark.parametrize("make", WITH_TARGET.values(), ids=WITH_TARGET)
@@ -52,18 +50,8 @@ def test_no_more_evaluations_than_the_error_needs(make):
         assert abs(found.log_evidence - LOG_EVIDENCE) < 4 * found.se
         numbers.append(sum(map(len, batches)))
         target = found.se / 1.5
-    assert numbers[0] <= 3 * FEWEST  # warped, or with a plan
+    assert numbers[0] <= 3 * FEWEST  # with a plan
     assert numbers[1] > 1.4 * numbers[0]
-
-
-def test_the_mean_likelihood_of_as_many_draws_of_the_prior():
-    target, rng = TwoModes(1), np.random.default_rng(101)
-    posterior = target.posterior((2, 20), rng)
-    for target_se, n_draws in ((0.05, 2000), (0.02, 10_000)):
-        found = PriorMonteCarlo(target_se=target_se).estimate(posterior, rng=rng)
-        assert found.settings["n_prior_draws"] <= n_draws
-        assert found.se <= target_se or found.settings["n_prior_draws"] == n_draws
-        assert abs(found.log_evidence - target.log_evidence) < 4 * found.se
 
 
 # The number of evaluations is decided by the error in most of the replications.
@@ -74,7 +62,6 @@ def test_the_mean_likelihood_of_as_many_draws_of_the_prior():
         pytest.param(ChibJeliazkov, 1.0, 0.025, marks=pytest.mark.slow),
         (Importance, 1.0, 0.03),
         pytest.param(Bridge, 1.0, 0.0135, marks=pytest.mark.slow),
-        pytest.param(WITH_TARGET["warp_bridge"], 1.0, 0.015, marks=pytest.mark.slow),
         pytest.param(Importance, 1.4, 0.05, marks=pytest.mark.slow),
     ],
 )
@@ -124,11 +111,6 @@ class TestShortfall:
         found = Importance(target_se=0.01).estimate(posterior, rng=rng)
         assert found.settings["n_proposals"] == MOST
         assert "come from the evaluations: draw more" in found.shortfall
-        found = PriorMonteCarlo(n_draws=1500, target_se=0.01).estimate(
-            Regression(2, 4, rng).posterior((2, 20), rng), rng=rng
-        )
-        assert found.settings["n_prior_draws"] == 1500
-        assert "raise n_draws of PriorMonteCarlo" in found.shortfall
 
     def test_is_a_warning(self):
         idata = exact_draws((2, 100))
@@ -162,15 +144,15 @@ class TestShared:
 
     def test_a_point_is_evaluated_once(self):
         posterior, batches = counted(self.posterior())
-        estimators = Bridge(target_se=0.05), ChibJeliazkov(target_se=0.05), Bridge(True, 0.05)
+        estimators = Bridge(target_se=0.05), ChibJeliazkov(target_se=0.05)
         n_alone = 0
         for estimator in estimators:
             together = estimator.estimate(posterior, rng=np.random.default_rng(108))
             by_itself, own = counted(self.posterior())
             assert together == estimator.estimate(by_itself, rng=np.random.default_rng(108))
             n_alone += sum(map(len, own))
-        # All three start from the first blocks of both halves.
-        assert sum(map(len, batches)) == n_alone - 2 * 2 * BLOCK
+        # Both start from the first block of each half.
+        assert sum(map(len, batches)) == n_alone - 2 * BLOCK
 
     def test_a_copy_of_the_posterior_has_its_own(self):
         posterior = self.posterior()

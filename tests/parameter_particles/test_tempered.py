@@ -61,12 +61,12 @@ def test_the_result_is_that_of_a_sampler(conjugate_run):
     table = psf.compare_evidence({"one": conjugate_run, "two": conjugate_run})
     np.testing.assert_allclose(table["prob"], 0.5)
     assert table["n_observations"].tolist() == [17, 17]
-    found = psf.estimate_evidence(
-        conjugate_run, conjugate(), estimators="bridge", random_seed=1, progressbar=False
-    )["bridge"]
+    found = psf.estimate_evidence(conjugate_run, conjugate(), random_seed=1, progressbar=False)[
+        "importance"
+    ]
     error = np.hypot(found.se, conjugate_run.attrs["log_evidence_se"])
     assert abs(found.log_evidence - conjugate_run.attrs["log_evidence"]) < 4 * error
-    assert list(conjugate_run["evidence"]["estimator"].values) == ["smc", "bridge"]
+    assert list(conjugate_run["evidence"]["estimator"].values) == ["smc", "importance"]
 
 
 def test_populations_have_draws_in_proportion_to_their_evidence(conjugate_run):

@@ -66,7 +66,7 @@ def table(rivals):
 def estimates():
     return {
         "bridge": an_evidence(-5.0, 0.02),
-        "laplace": an_evidence(-5.3, np.nan, estimator="laplace"),
+        "rough": an_evidence(-5.3, np.nan, estimator="rough"),
     }
 
 

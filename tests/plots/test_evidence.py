@@ -34,7 +34,7 @@ def test_numbers_beside_the_points(table, estimates):
     assert text["cubic"]["string"] == "-5.00 ± 0.30"
     assert text["cubic"]["horizontal_align"] == "right"
     assert text["linear"]["horizontal_align"] == "left"
-    assert drawn(plot_evidence(estimates, backend="none"), "text")["laplace"]["string"] == "-5.30"
+    assert drawn(plot_evidence(estimates, backend="none"), "text")["rough"]["string"] == "-5.30"
 
 
 def test_a_small_error_is_not_written_as_none(table):
@@ -78,8 +78,8 @@ def test_round_numbers(low, high, labels):
 
 def test_an_estimate_without_error_has_no_bar(estimates):
     collection = plot_evidence(estimates, backend="none")
-    assert drawn(collection, "point")["laplace"] is not None
-    assert drawn(collection, "one_se")["laplace"] is None
+    assert drawn(collection, "point")["rough"] is not None
+    assert drawn(collection, "one_se")["rough"] is None
     assert drawn(collection, "one_se")["bridge"] is not None
 
 

@@ -100,7 +100,7 @@ def compare_evidence(
             With `step_errors`: the change of the log-evidence if the integration step is halved,
             and its standard error; NaN for models that are not named there.
 
-        If an evidence has no standard error (``se`` is NaN, as for Laplace's), the probabilities
+        If an evidence has no standard error (``se`` is NaN), the probabilities
         are those of the estimates, and all intervals are NaN, because each depends on every
         evidence. Comparisons with that model are undecided, and its ``strength`` ignores errors.
 

@@ -3,10 +3,7 @@
 from .bridge import Bridge
 from .chib_jeliazkov import ChibJeliazkov
 from .importance import Importance
-from .laplace import Laplace
-from .prior_monte_carlo import PriorMonteCarlo
 from .protocol import Estimate, Estimator
-from .tempered_smc import TemperedSMC
 
 __all__ = [
     "Bridge",
@@ -14,7 +11,4 @@ __all__ = [
     "Estimate",
     "Estimator",
     "Importance",
-    "Laplace",
-    "PriorMonteCarlo",
-    "TemperedSMC",
 ]

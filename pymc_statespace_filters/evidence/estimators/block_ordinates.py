@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 from scipy.special import softmax
 
 from ...errors import DataMismatchError
-from ...importance import log_mean, mcse_of_walkers
+from ...importance import log_mean, mcse_of_chains, mcse_of_walkers
 from ..posterior import Posterior
 from .random_walk_proposal import Proposal
 from .whitening import Whitening
@@ -123,7 +123,7 @@ def estimate_in_blocks(
         numerator, numerator_terms = _normalised(log_to_center, "draws moved to the central point")
         # Both terms come from one run, so that the error is that of their difference.
         terms = numerator_terms - denominator_terms
-        errors.append(thinned.mcse(terms) if start == 0 else mcse_of_walkers(terms))
+        errors.append(mcse_of_chains(terms) if start == 0 else mcse_of_walkers(terms))
 
         if is_last:
             constant = np.full((1, n_proposals), proposal.log_density)

@@ -44,6 +44,7 @@ from ...importance import (
     MIN_EFFECTIVE,
     LogMean,
     disagreement,
+    log_mean_of_draws,
     log_mean_of_independent,
 )
 from ...system.checks import check_count
@@ -126,7 +127,7 @@ class ChibJeliazkov:
                 )
                 for p, half in pairs
             ]
-            found = _of_one_block(single, posterior)
+            found = _of_one_block(single)
             se_draws = found.settings["n_effective_numerator"] ** -0.5
             se_proposals = found.settings["n_effective_denominator"] ** -0.5
         else:
@@ -207,7 +208,7 @@ def estimate_in_one_block(
     # Numerator: the draws, with the log-densities stored by the chain.
     log_terms = proposal.log_alpha_to_center(posterior.log_density)
     log_terms = log_terms + proposal.log_q(posterior.draws)
-    numerator = posterior.log_mean(log_terms)
+    numerator = log_mean_of_draws(log_terms)
 
     # Denominator: draws from q(x*, .), with fresh log-densities.
     ratio = 0.0 if target_se is None else ratio_of_errors(target_se, numerator.error)
@@ -242,7 +243,7 @@ def _choose_n_blocks(k: int, plans: Sequence[ProposalPlan]) -> int:
     return max(2, -(-k // BLOCK_SIZE))
 
 
-def _of_one_block(folds: Sequence[OneBlockEstimate], posterior: Posterior) -> Estimate:
+def _of_one_block(folds: Sequence[OneBlockEstimate]) -> Estimate:
     numerator = _effective(fold.numerator.n_effective for fold in folds)
     denominator = _effective(fold.denominator.n_effective for fold in folds)
     doubts = []
@@ -256,7 +257,7 @@ def _of_one_block(folds: Sequence[OneBlockEstimate], posterior: Posterior) -> Es
             f"the proposals have an effective number of {denominator:.0f}, fewer than "
             f"{MIN_EFFECTIVE}: raise n_proposals, or reparametrise towards a Gaussian posterior"
         )
-    doubts += posterior.worst_disagreement(fold.disagreement for fold in folds)
+    doubts += sorted({fold.disagreement for fold in folds if fold.disagreement})[-1:]
     settings = {
         "n_blocks": 1,
         "scale": math.sqrt(folds[0].scale * folds[1].scale),

@@ -17,7 +17,7 @@ class Estimate:
     ----------
     log_evidence : float
     se : float
-        Numerical standard error; NaN if the estimator has none, as Laplace's.
+        Numerical standard error; NaN if the estimator has none.
     settings : mapping of str to float
         Settings and diagnostics (scales, counts, effective sample sizes), stored in the group
         ``evidence`` beside the estimate.
@@ -42,8 +42,7 @@ class Estimator(Protocol):
     Any object with these three members can be passed to `estimate_evidence`. Its own settings are
     its attributes, checked when it is constructed; it raises `ModelError` for a model that it
     cannot treat. A frozen dataclass with a field ``target_se`` that is None gets that of
-    `estimate_evidence`. An estimator whose estimate does not rest on the draws says so by an
-    attribute ``uses_draws = False``; it is then not told that the chains disagree.
+    `estimate_evidence`.
 
     Examples
     --------
@@ -101,11 +100,3 @@ class Estimator(Protocol):
 
     def n_evaluations(self, posterior: Posterior) -> int:
         """Approximate number of log-density evaluations, for the progress bar."""
-
-
-def uses_draws(estimator: Estimator) -> bool:
-    """Whether an estimate rests on the posterior draws, as it does unless the estimator denies it.
-
-    The attribute is optional, so that objects without it are estimators too.
-    """
-    return getattr(estimator, "uses_draws", True)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
 from ...errors import DataMismatchError
-from ...importance import log_mean
+from ...importance import log_mean, log_mean_of_draws
 from ..posterior import Posterior
 from .stopping import ratio_of_errors
 from .whitening import BLOCK, NormalProposals, Whitening, moments
@@ -186,7 +186,7 @@ def _predicted_variances(
         E_q[alpha(x*, x)^2] = p(D) / e^f(x*) E_pi[exp(-|f(x) - f(x*)|) q(x, x*)].
     """
     log_q = proposal.log_q(posterior.draws)
-    numerator = posterior.log_mean(proposal.log_alpha_to_center(posterior.log_density) + log_q)
+    numerator = log_mean_of_draws(proposal.log_alpha_to_center(posterior.log_density) + log_q)
     second = log_mean(log_q - np.abs(posterior.log_density - proposal.log_density))
     log_ordinate = proposal.log_density - log_evidence  # of the posterior density
     log_relative = min(second + log_ordinate - 2 * numerator.value, MAX_LOG)

@@ -35,7 +35,7 @@ def check_target(target_se: float | None) -> None:
         check_positive("target_se", target_se)
 
 
-def totals(posterior: Posterior, target_se: float | None, most: int = MOST) -> Iterator[int]:
+def totals(posterior: Posterior, target_se: float | None) -> Iterator[int]:
     """Totals after which an estimator looks at its error; without a target, only one.
 
     That one is the number of draws, within 1000 to 10 000.
@@ -43,11 +43,11 @@ def totals(posterior: Posterior, target_se: float | None, most: int = MOST) -> I
     if target_se is None:
         yield min(max(posterior.log_density.size, FEWEST), MOST_WITHOUT_TARGET)
         return
-    total = min(FEWEST, most)
-    while total < most:
+    total = FEWEST
+    while total < MOST:
         yield total
         total *= 2
-    yield most
+    yield MOST
 
 
 def is_small(
