@@ -172,8 +172,8 @@ class ChainProgress(ProgressBarManager):
 class _RowProgress:
     """A bar that appears when its task has taken some seconds; the next task begins a new one."""
 
-    def __init__(self, stack: ExitStack, patience: float) -> None:
-        self._stack, self._patience = stack, patience
+    def __init__(self, stack: ExitStack) -> None:
+        self._stack = stack
         self._total = self._done = 0
         self._shown: tuple | None = None
         self.begin("", 0)
@@ -187,15 +187,13 @@ class _RowProgress:
         self._task, self._total = task, total
         self._done, self._start = 0, perf_counter()
         self._shown = None
-        if task and self._patience == 0.0:
-            self._show()
 
     def advance(self, count: int) -> None:
         self._done += count
         if self._shown is not None:
             bar, row = self._shown
             bar.advance(row, advance=count)
-        elif perf_counter() - self._start > self._patience:
+        elif perf_counter() - self._start > PATIENCE:
             self._show()
 
     def _show(self) -> None:
@@ -211,15 +209,13 @@ class ReportsRows(Protocol):
 
 
 @contextmanager
-def row_progress(
-    work: ReportsRows, *, enabled: bool, patience: float | None = None
-) -> Iterator[Callable[[str, int], None]]:
-    """Show the progress of work that takes longer than ``patience`` seconds, by default `PATIENCE`.
+def row_progress(work: ReportsRows, *, enabled: bool) -> Iterator[Callable[[str, int], None]]:
+    """Show the progress of work that takes longer than `PATIENCE` seconds.
 
     Yields the function that begins a task, with its name and about how many rows it has.
     """
     with ExitStack() as stack:
-        bar = _RowProgress(stack, PATIENCE if patience is None else patience)
+        bar = _RowProgress(stack)
         if enabled:
             work.on_progress = bar.advance
         yield bar.begin if enabled else lambda task, total: None

@@ -38,7 +38,7 @@ LONGEST = (
     "point_estimation/test_maximum_likelihood.py",
     "sampling/test_sample_dram.py",
     "filters/test_sigma_points.py",
-    "sampling/test_particle_budget.py",
+    "sampling/test_particle_number.py",
     "filters/test_outside_filters.py",
     "test_processes.py",
     "pymc_model/test_jax_samplers.py",

@@ -141,21 +141,6 @@ def _check_at(
     return pd.DataFrame(rows)
 
 
-def doubt_at(
-    model: pm.Model, name: str, filter: Filter, draws: Array, rng: np.random.Generator
-) -> str | None:
-    """What is wrong with a filter of a variable at draws (n, k) of the unconstrained space, if so.
-
-    See `check_model`.
-    """
-    if not _needs_check(state_space_nodes(model)[name].op.system, filter):
-        return None
-    budget = Budget(LEAST_SECONDS)
-    with np.errstate(invalid="ignore"):
-        findings = _check_variable(model, name, filter, draws, N_POINTS, budget, rng)
-    return next((one.verdict for one in findings if one.outcome == OFF), None)
-
-
 def _plain_row(filter: Filter) -> Finding:
     name = short_form(filter)
     if filter.noisy:

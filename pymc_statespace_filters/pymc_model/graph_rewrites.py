@@ -173,15 +173,6 @@ def with_filter(
     return clone_replace(list(graphs), replaced)
 
 
-def likelihood_terms(graph: TensorVariable, model: pm.Model, name: str) -> TensorVariable:
-    """The terms log p(d_j | d_1 .. d_{j-1}) of a variable in the graph of a log-density."""
-    variable = state_space_nodes(model)[name]
-    for node in likelihood_nodes([graph]):
-        if _is_likelihood_of(node, model, variable):
-            return node.outputs[0]
-    raise ModelError(f"the graph must contain the likelihood of {name}")
-
-
 def _is_likelihood_of(node: Any, model: pm.Model, variable: Any) -> bool:
     """Whether a likelihood node has the system, filter, steps, data and seed of a variable."""
     expected = (variable.inputs[3], model.rvs_to_values[variable.outputs[1]], variable.inputs[-1])

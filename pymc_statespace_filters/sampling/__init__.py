@@ -2,7 +2,7 @@
 
 from .chosen_sampler import sample
 from .dram_chains import sample_dram
-from .particle_number.suggest import suggest_particles
+from .particle_number import suggest_particles
 from .starts.find_starts import find_starts
 from .step import DRAM
 from .target.settings import RandomWalkSettings

@@ -52,4 +52,4 @@ def test_pseudo_marginal_chains_are_within_a_tenth_of_a_nat():
 @pytest.mark.slow
 def test_the_number_of_particles_is_the_one_suggested():
     model = double_well.model(psf.BootstrapPF(N_PARTICLES))
-    assert psf.suggest_particles(model, random_seed=1).attrs["n_particles"] == N_PARTICLES
+    assert psf.suggest_particles(model, random_seed=1).loc["d", "n_particles"] == N_PARTICLES

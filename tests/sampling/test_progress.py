@@ -159,7 +159,8 @@ def test_a_row_that_was_an_estimate_is_whole_at_the_end(monkeypatch):
     monkeypatch.setattr(
         progress, "create_simple_progress", lambda: shown.append(screen()) or shown[-1]
     )
-    with progress.row_progress(work, enabled=True, patience=0.0) as begin:
+    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    with progress.row_progress(work, enabled=True) as begin:
         begin("a part", 100)
         work.on_progress(94)
     assert [bar.tasks[0].percentage for bar in shown] == [100.0]

@@ -59,7 +59,12 @@ _PRIOR_WEIGHT = 0.2
 
 
 def population_of(
-    model: Model, rng: np.random.Generator, *, progressbar: bool, settles: bool = True
+    model: Model,
+    rng: np.random.Generator,
+    *,
+    progressbar: bool,
+    n_points: int = N_POINTS,
+    settles: bool = True,
 ) -> tuple[Points, RaveledVariables]:
     """Points distributed nearly as a model's posterior, and their coordinates.
 
@@ -81,7 +86,9 @@ def population_of(
         )
     target = Target(model, None, RandomWalkSettings())
     target.prepare()
-    found = find_population(target, rng, progressbar=progressbar, settles=settles)
+    found = find_population(
+        target, rng, progressbar=progressbar, n_points=n_points, settles=settles
+    )
     return found, target.raveled
 
 

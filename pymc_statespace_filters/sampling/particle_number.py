@@ -1,0 +1,327 @@
+"""``suggest_particles``: how many particles the estimated likelihood of a model needs."""
+
+import math
+import warnings
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from numpy.typing import NDArray
+from pymc.model import Model
+
+from ..errors import INSIDE, FilterWarning, ModelError
+from ..filters.recommendation import short_form
+from ..former_names import former_names
+from ..progress import row_progress
+from ..pymc_model.aligned_axes import records_of_rows
+from ..pymc_model.checked_model import checked_model
+from ..pymc_model.density import RowFunction, check_free_variables
+from ..pymc_model.graph_rewrites import with_filter
+from ..pymc_model.inspection import (
+    given_model,
+    log_density_terms,
+    noisy_filters,
+    quieter_filter,
+    resized,
+    state_space_nodes,
+)
+from ..pymc_model.other_filter import model_with_filters
+from ..pymc_model.panel_structure import panel_structure
+from ..pymc_model.posterior_draws import unconstrained_draws
+from ..system.checks import check_random_seed
+from .kernel.state import draw_seeds
+from .output.likelihood_variance import TARGET
+from .starts.population import population_of
+
+# The search for a point: its population, and the range of particles with which it evaluates.
+_N_POINTS, _FEWEST_IN_SEARCH, _MOST_IN_SEARCH = 32, 200, 1000
+_N_MEASURED, _N_SEEDS = 12, 12  # points of the posterior, and estimates at each
+_LEAST = 10  # particles
+_STEP = 16.0  # most by which the second number differs from the first
+# A variance falls as 1/N if N times the variance grows by less than this.
+_GROWTH = 2.0
+_SMALLEST = 1e-12  # variance, of an estimate without noise
+
+Array = NDArray[np.float64]
+
+
+class _Measured(NamedTuple):
+    n_particles: int
+    variance: float  # infinity if most of the estimates fail
+
+    def __str__(self) -> str:
+        return f"{self.variance:.2g} with {self.n_particles} particles"
+
+
+@former_names(
+    var_name="the table has a row for every noisy variable",
+    max_seconds="it measures two numbers of particles and ends",
+)
+def suggest_particles(
+    model: Model | None = None,
+    *,
+    idata: xr.DataTree | None = None,
+    target: tuple[float, float] = TARGET,
+    random_seed: int | np.random.Generator | None = None,
+    progressbar: bool = True,
+) -> pd.DataFrame:
+    """Find the number of particles at which a chain gains most per unit of time.
+
+    At twelve draws of the posterior the log-likelihood is estimated with twelve noise seeds each.
+    Its variance is about proportional to 1/N for N particles, and is measured again with the number
+    that should bring it into the target range.
+
+    Parameters
+    ----------
+    model : pymc.Model, optional
+        Default: the model of the ``with`` block. It has noisy filters, and continuous free
+        variables.
+    idata : xarray.DataTree, optional
+        Draws of its posterior, by any filter. Default: those of a small search such as
+        `find_starts` makes.
+    target : (float, float), default (1.0, 3.3)
+        Range for the variance of the estimated log-likelihood. Per unit of time chains gain most
+        between 1 and 3.3 [1]_, [2]_. Several noisy variables have equal shares of it. In a panel
+        whose records share no parameter, `sample_dram` accepts each record by its own likelihood,
+        and the range is that of the record with the largest variance; with shared parameters it is
+        that of the sum.
+    random_seed : None, int or numpy.random.Generator
+    progressbar : bool
+        Whether to show the progress, if it takes longer than two seconds.
+
+    Returns
+    -------
+    pandas.DataFrame
+        A row for each noisy variable, indexed by ``variable``:
+
+        ``filter``
+            as it is in the model
+        ``variance``
+            of the estimated log-likelihood with this filter, the median of the draws; infinite if
+            most estimates fail
+        ``low``, ``high``
+            the range for the variable
+        ``n_particles``
+            the number to take; missing if no number can be named
+        ``reason``
+            what has been measured, in words
+
+    Raises
+    ------
+    ModelError
+        If an argument is not as described, the model has no noisy variable or a discrete free
+        variable, or the search for draws fails, as with an improper prior.
+    DataMismatchError
+        If idata does not belong to the model.
+
+    Warns
+    -----
+    FilterWarning
+        If the variance does not fall as 1/N: particles collapse at some observation.
+
+    Notes
+    -----
+    The search makes 1000 to 2500 evaluations, with 200 to 1000 particles. The second number is at
+    most 16 times the first, or a sixteenth of it. If its variance lies outside the range, the
+    number named is interpolated, or extrapolated by 1/N; it is at least 10. Its variance has an
+    error of a fifth or so, and the range is wider.
+
+    For EnKF and PFEnKF the number of members also changes the bias, of which a small variance says
+    nothing: see `check_filter`.
+
+    References
+    ----------
+    .. [1] A. Doucet, M. K. Pitt, G. Deligiannidis and R. Kohn (2015). Efficient implementation of
+       Markov chain Monte Carlo when using an unbiased likelihood estimator. Biometrika 102,
+       295-313.
+    .. [2] C. Sherlock, A. H. Thiery, G. O. Roberts and J. S. Rosenthal (2015). On the efficiency of
+       pseudo-marginal random walk Metropolis algorithms. Annals of Statistics 43, 238-275.
+
+    Examples
+    --------
+    >>> import pymc as pm
+    >>> import pymc_statespace_filters as psf
+    >>> system = psf.StateSpaceModel(
+    ...     transition=lambda x, q, a: [a * x[0] + q[0]],
+    ...     process_noise=[[1.0]],
+    ...     observation=lambda x: [x[0]],
+    ...     observation_noise=[[0.1]],
+    ...     initial_mean=[0.0],
+    ...     initial_cov=[[1.0]],
+    ... )
+    >>> record = psf.simulate(system, {"a": 0.8}, steps=range(1, 41), random_seed=1)
+    >>> with pm.Model() as model:
+    ...     a = pm.Normal("a", 0, 1)
+    ...     d = psf.StateSpace(
+    ...         "d", system, psf.BootstrapPF(200), steps=range(1, 41),
+    ...         observed=record["observations"],
+    ...     )
+    >>> table = psf.suggest_particles(model, random_seed=1)
+    >>> better = psf.BootstrapPF(table.loc["d", "n_particles"])
+    >>> 20 < better.n_particles < 100
+    True
+    """
+    model = given_model(model)
+    filters: dict[str, Any] = noisy_filters(model)
+    if not filters:
+        raise ModelError(
+            "model must have a StateSpace variable with a noisy likelihood (particles or an "
+            "ensemble), got a model without one"
+        )
+    check_free_variables(model)
+    low, high = (end / len(filters) for end in _checked_target(target))
+    rng = check_random_seed(random_seed)
+    if idata is None:
+        model = _with_moderate_numbers(model, filters)  # whose coordinates have an order of its own
+        found, _ = population_of(model, rng, progressbar=progressbar, n_points=_N_POINTS)
+        points = found.x
+    else:
+        checked_model(model, idata, any_filter=True)
+        points = np.concatenate(unconstrained_draws(idata, model))
+    estimates = _Estimates(model, filters, rng, progressbar=progressbar)
+    chosen = points[np.linspace(0, len(points) - 1, _N_MEASURED).astype(int)]
+    first = estimates.variances(chosen)
+    numbers = {
+        name: n
+        for name, measured in first.items()
+        if (n := _second_number(measured, low, high)) != measured.n_particles
+    }
+    second = {}
+    if numbers:
+        estimates.resize(numbers)
+        second = estimates.variances(chosen)
+    rows = []
+    for name, filter in filters.items():
+        measured = second[name] if name in numbers else None
+        n_particles, reason = _suggestion(first[name], measured, low, high)
+        if n_particles is None:
+            other = quieter_filter(model, name)
+            reason += f"; {short_form(other)} may do better" if other is not None else ""
+            warnings.warn(f"{name}: {reason}", FilterWarning, skip_file_prefixes=INSIDE)
+        variance = first[name].variance
+        rows.append((name, short_form(filter), variance, low, high, n_particles, reason))
+    columns = ["variable", "filter", "variance", "low", "high", "n_particles", "reason"]
+    table = pd.DataFrame(rows, columns=columns).set_index("variable")
+    return table.astype({"n_particles": "Int64"})  # which may be missing
+
+
+def _with_moderate_numbers(model: Model, filters: Mapping[str, Any]) -> Model:
+    """The model with filters by which a search is neither slow nor led by noise."""
+    moderate = {
+        name: resized(filter, int(np.clip(filter.size(), _FEWEST_IN_SEARCH, _MOST_IN_SEARCH)))
+        for name, filter in filters.items()
+    }
+    return model_with_filters(model, moderate)
+
+
+class _Estimates:
+    """Estimates of a model's log-density with new noise."""
+
+    def __init__(
+        self,
+        model: Model,
+        filters: Mapping[str, Any],
+        rng: np.random.Generator,
+        *,
+        progressbar: bool,
+    ):
+        self._model, self._filters, self._rng = model, filters, rng
+        self._progressbar = progressbar
+        self._starts = _records_moved_alone(model)
+        self._density = self._compiled()
+
+    def variances(self, points: Array) -> dict[str, _Measured]:
+        """The variances of the log-likelihoods of the noisy variables at points (m, d)."""
+        x = np.repeat(points, _N_SEEDS, axis=0)
+        seeds = draw_seeds(self._rng, (len(x), len(self._filters)))
+        with row_progress(self._density.calls, enabled=self._progressbar) as announce:
+            announce("Estimating the variance", len(x))
+            _, *terms = self._density.calls(x, *seeds.T)
+        return {
+            name: _Measured(filter.size(), self._variance(name, of_variable))
+            for (name, filter), of_variable in zip(self._filters.items(), terms, strict=True)
+        }
+
+    def resize(self, numbers: Mapping[str, int]) -> None:
+        """Give some of the filters another number of particles."""
+        self._filters = {
+            name: resized(filter, numbers.get(name, filter.size()))
+            for name, filter in self._filters.items()
+        }
+        self._density = self._compiled()
+
+    def _compiled(self) -> RowFunction:
+        """The log-density, and the terms of the likelihood of each noisy variable."""
+        terms = dict(log_density_terms(self._model))
+        total = sum(term.sum() for term in terms.values())
+        graphs = [total, *(terms[name] for name in self._filters)]
+        total, *of_variables = with_filter(graphs, self._model, self._filters)
+        return RowFunction(self._model, total, of_variables)
+
+    def _variance(self, name: str, terms: Array) -> float:
+        """The median over points, from terms (m * seeds, J); of records the largest."""
+        starts = self._starts.get(name, np.array([0]))
+        sums = np.add.reduceat(terms, starts, axis=1).reshape(-1, _N_SEEDS, starts.size)
+        is_known = np.isfinite(sums)
+        variances = np.ma.array(sums, mask=~is_known).var(axis=1, ddof=1).filled(np.inf)
+        variances[is_known.mean(axis=1) <= 0.5] = np.inf
+        return float(np.median(variances, axis=0).max())
+
+
+def _records_moved_alone(model: Model) -> dict[str, NDArray[np.int64]]:
+    """The first row of each record of a panel variable, if no move of a chain needs all records."""
+    structure = panel_structure(model)
+    if structure is None or structure.shared:
+        return {}
+    rows = state_space_nodes(model)[structure.name].inputs[3]
+    return {structure.name: np.unique(records_of_rows(rows), return_index=True)[1]}
+
+
+def _second_number(measured: _Measured, low: float, high: float) -> int:
+    """The number that should have a variance in the range, not too far from the first."""
+    if low <= measured.variance <= high:
+        return measured.n_particles
+    factor = float(np.clip(measured.variance / math.sqrt(low * high), 1 / _STEP, _STEP))
+    return _rounded(factor * measured.n_particles)
+
+
+def _suggestion(
+    first: _Measured, second: _Measured | None, low: float, high: float
+) -> tuple[int | None, str]:
+    """A number of particles whose variance lies in the range, and why; None if there is none.
+
+    Between two measurements the variance is a power of the number, and beyond them that is -1.
+    """
+    if second is None:
+        return first.n_particles, f"the variance is {first}"
+    found = f"the variance is {first} and {second}"
+    if low <= second.variance <= high:
+        return second.n_particles, found
+    if first.variance < low and math.isinf(second.variance):
+        return first.n_particles, found
+    more = second.n_particles / first.n_particles
+    ratio = max(second.variance, _SMALLEST) / max(first.variance, _SMALLEST)
+    if min(first.variance, second.variance) > high and not ratio * more <= _GROWTH:
+        return None, f"{found}: particles collapse at some observation, so that it falls too slowly"
+    aim = math.sqrt(low * high)
+    lies_between = (first.variance > aim) != (second.variance > aim) and ratio > 0.0
+    exponent = -math.log(more) / math.log(ratio) if lies_between else 1.0
+    n_particles = _rounded(second.n_particles * (second.variance / aim) ** exponent)
+    return n_particles, f"{found}; it should be about {aim:.1f} with {n_particles}"
+
+
+def _rounded(number: float) -> int:
+    """Two digits of it, and at least ten."""
+    return max(_LEAST, int(float(f"{number:.1e}")))
+
+
+def _checked_target(target: Any) -> tuple[float, float]:
+    try:
+        low, high = (float(end) for end in target)
+    except (TypeError, ValueError):
+        low, high = np.nan, np.nan
+    if not 0.0 < low < high < np.inf:
+        raise ModelError(f"target must be two positive numbers, the smaller first, got {target!r}")
+    return low, high

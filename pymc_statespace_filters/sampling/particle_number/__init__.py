@@ -1,1 +1,0 @@
-"""Measurement of the number of particles that a noisy likelihood needs."""
