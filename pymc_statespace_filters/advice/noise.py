@@ -25,6 +25,7 @@ from ..sampling.output.likelihood_variance import (
     acceptance_share,
     seed_spread,
 )
+from ..sampling.particle_number import SlowVariance
 from ..sampling.target.log_density import LogDensity
 from ..sampling.target.target import Target
 from .collapse import collapse_remedies, speed_up
@@ -82,6 +83,14 @@ def _(fact: NoisyStarts) -> list[str]:
         f"{acceptance_share(spread.variance):.1g} of the moves that they would accept with an "
         f"exact likelihood. {remedy}"
     ]
+
+
+@sentences.register
+def _(fact: SlowVariance) -> list[str]:
+    """More particles hardly make the estimates less noisy."""
+    other = quieter_filter(fact.model, fact.name)
+    remedy = "" if other is None else f". Use {short_form(other)}, which has less noise here"
+    return [f"{fact.name}: {fact.measured}{remedy}"]
 
 
 def variance_advice(

@@ -1,8 +1,9 @@
 """``suggest_particles``: how many particles the estimated likelihood of a model needs."""
 
 import math
-import warnings
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,8 +12,9 @@ import xarray as xr
 from numpy.typing import NDArray
 from pymc.model import Model
 
-from ..errors import INSIDE, FilterWarning, ModelError
-from ..filters.recommendation import short_form
+from ..errors import ModelError
+from ..facts import Fact, tell
+from ..filters.written import short_form
 from ..former_names import former_names
 from ..progress import row_progress
 from ..pymc_model.aligned_axes import records_of_rows
@@ -23,7 +25,6 @@ from ..pymc_model.inspection import (
     given_model,
     log_density_terms,
     noisy_filters,
-    quieter_filter,
     resized,
     state_space_nodes,
 )
@@ -35,16 +36,24 @@ from .kernel.state import draw_seeds
 from .output.likelihood_variance import TARGET
 from .starts.population import population_of
 
-# The search for a point: its population, and the range of particles with which it evaluates.
-_N_POINTS, _FEWEST_IN_SEARCH, _MOST_IN_SEARCH = 32, 200, 1000
+# Of the search for draws: points, and particles with which it is neither led by noise nor slow.
+_N_POINTS, _IN_SEARCH = 32, (200, 1000)
 _N_MEASURED, _N_SEEDS = 12, 12  # points of the posterior, and estimates at each
 _LEAST = 10  # particles
 _STEP = 16.0  # most by which the second number differs from the first
-# A variance falls as 1/N if N times the variance grows by less than this.
-_GROWTH = 2.0
-_SMALLEST = 1e-12  # variance, of an estimate without noise
+_GROWTH = 2.0  # of N times the variance, up to which that falls about as 1/N
+_SMALLEST = 1e-12  # variance
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SlowVariance(Fact):
+    """A variable whose estimates have a variance that does not fall as 1/N."""
+
+    model: Model
+    name: str
+    measured: str
 
 
 class _Measured(NamedTuple):
@@ -70,8 +79,8 @@ def suggest_particles(
     """Find the number of particles at which a chain gains most per unit of time.
 
     At twelve draws of the posterior the log-likelihood is estimated with twelve noise seeds each.
-    Its variance is about proportional to 1/N for N particles, and is measured again with the number
-    that should bring it into the target range.
+    Its variance is about proportional to 1/N for N particles. It is measured again with the number
+    that should bring it into the target.
 
     Parameters
     ----------
@@ -133,11 +142,8 @@ def suggest_particles(
 
     References
     ----------
-    .. [1] A. Doucet, M. K. Pitt, G. Deligiannidis and R. Kohn (2015). Efficient implementation of
-       Markov chain Monte Carlo when using an unbiased likelihood estimator. Biometrika 102,
-       295-313.
-    .. [2] C. Sherlock, A. H. Thiery, G. O. Roberts and J. S. Rosenthal (2015). On the efficiency of
-       pseudo-marginal random walk Metropolis algorithms. Annals of Statistics 43, 238-275.
+    .. [1] A. Doucet and others (2015). Biometrika 102, 295-313.
+    .. [2] C. Sherlock and others (2015). Annals of Statistics 43, 238-275.
 
     Examples
     --------
@@ -174,32 +180,26 @@ def suggest_particles(
     low, high = (end / len(filters) for end in _checked_target(target))
     rng = check_random_seed(random_seed)
     if idata is None:
-        model = _with_moderate_numbers(model, filters)  # whose coordinates have an order of its own
-        found, _ = population_of(model, rng, progressbar=progressbar, n_points=_N_POINTS)
-        points = found.x
+        moderate = {
+            name: resized(filter, int(np.clip(filter.size(), *_IN_SEARCH)))
+            for name, filter in filters.items()
+        }
+        model = model_with_filters(model, moderate)  # whose coordinates have an order of its own
+        points = population_of(model, rng, progressbar=progressbar, n_points=_N_POINTS)[0].x
     else:
         checked_model(model, idata, any_filter=True)
         points = np.concatenate(unconstrained_draws(idata, model))
-    estimates = _Estimates(model, filters, rng, progressbar=progressbar)
     chosen = points[np.linspace(0, len(points) - 1, _N_MEASURED).astype(int)]
-    first = estimates.variances(chosen)
-    numbers = {
-        name: n
-        for name, measured in first.items()
-        if (n := _second_number(measured, low, high)) != measured.n_particles
-    }
-    second = {}
-    if numbers:
-        estimates.resize(numbers)
-        second = estimates.variances(chosen)
+    measure = partial(_measured, model, x=chosen, rng=rng, progressbar=progressbar)
+    first = measure(filters)
+    numbers = {name: _second_number(measured, low, high) for name, measured in first.items()}
+    others = {name: resized(filter, numbers[name]) for name, filter in filters.items()}
+    second = first if others == filters else measure(others)
     rows = []
     for name, filter in filters.items():
-        measured = second[name] if name in numbers else None
-        n_particles, reason = _suggestion(first[name], measured, low, high)
+        n_particles, reason = _suggestion(first[name], second[name], low, high)
         if n_particles is None:
-            other = quieter_filter(model, name)
-            reason += f"; {short_form(other)} may do better" if other is not None else ""
-            warnings.warn(f"{name}: {reason}", FilterWarning, skip_file_prefixes=INSIDE)
+            tell(SlowVariance(model, name, reason))
         variance = first[name].variance
         rows.append((name, short_form(filter), variance, low, high, n_particles, reason))
     columns = ["variable", "filter", "variance", "low", "high", "n_particles", "reason"]
@@ -207,67 +207,40 @@ def suggest_particles(
     return table.astype({"n_particles": "Int64"})  # which may be missing
 
 
-def _with_moderate_numbers(model: Model, filters: Mapping[str, Any]) -> Model:
-    """The model with filters by which a search is neither slow nor led by noise."""
-    moderate = {
-        name: resized(filter, int(np.clip(filter.size(), _FEWEST_IN_SEARCH, _MOST_IN_SEARCH)))
-        for name, filter in filters.items()
+def _measured(
+    model: Model,
+    filters: Mapping[str, Any],
+    x: Array,
+    rng: np.random.Generator,
+    *,
+    progressbar: bool,
+) -> dict[str, _Measured]:
+    """The variances of the log-likelihoods of noisy variables at points (m, d), by new filters."""
+    terms = dict(log_density_terms(model))
+    graphs = with_filter([terms[name] for name in filters], model, filters)
+    total: Any = sum(graph.sum() for graph in graphs)
+    calls = RowFunction(model, total, graphs).calls
+    seeds = draw_seeds(rng, (len(x) * _N_SEEDS, len(filters)))
+    with row_progress(calls, enabled=progressbar) as announce:
+        announce("Estimating the variance", len(seeds))
+        _, *estimates = calls(np.repeat(x, _N_SEEDS, axis=0), *seeds.T)
+    starts = _records_moved_alone(model)
+    return {
+        name: _Measured(filter.size(), _variance(of_variable, starts.get(name, np.array([0]))))
+        for (name, filter), of_variable in zip(filters.items(), estimates, strict=True)
     }
-    return model_with_filters(model, moderate)
 
 
-class _Estimates:
-    """Estimates of a model's log-density with new noise."""
+def _variance(terms: Array, starts: NDArray[np.int64]) -> float:
+    """The median over points, from terms (m * seeds, J); of records, by their starts, the largest.
 
-    def __init__(
-        self,
-        model: Model,
-        filters: Mapping[str, Any],
-        rng: np.random.Generator,
-        *,
-        progressbar: bool,
-    ):
-        self._model, self._filters, self._rng = model, filters, rng
-        self._progressbar = progressbar
-        self._starts = _records_moved_alone(model)
-        self._density = self._compiled()
-
-    def variances(self, points: Array) -> dict[str, _Measured]:
-        """The variances of the log-likelihoods of the noisy variables at points (m, d)."""
-        x = np.repeat(points, _N_SEEDS, axis=0)
-        seeds = draw_seeds(self._rng, (len(x), len(self._filters)))
-        with row_progress(self._density.calls, enabled=self._progressbar) as announce:
-            announce("Estimating the variance", len(x))
-            _, *terms = self._density.calls(x, *seeds.T)
-        return {
-            name: _Measured(filter.size(), self._variance(name, of_variable))
-            for (name, filter), of_variable in zip(self._filters.items(), terms, strict=True)
-        }
-
-    def resize(self, numbers: Mapping[str, int]) -> None:
-        """Give some of the filters another number of particles."""
-        self._filters = {
-            name: resized(filter, numbers.get(name, filter.size()))
-            for name, filter in self._filters.items()
-        }
-        self._density = self._compiled()
-
-    def _compiled(self) -> RowFunction:
-        """The log-density, and the terms of the likelihood of each noisy variable."""
-        terms = dict(log_density_terms(self._model))
-        total = sum(term.sum() for term in terms.values())
-        graphs = [total, *(terms[name] for name in self._filters)]
-        total, *of_variables = with_filter(graphs, self._model, self._filters)
-        return RowFunction(self._model, total, of_variables)
-
-    def _variance(self, name: str, terms: Array) -> float:
-        """The median over points, from terms (m * seeds, J); of records the largest."""
-        starts = self._starts.get(name, np.array([0]))
-        sums = np.add.reduceat(terms, starts, axis=1).reshape(-1, _N_SEEDS, starts.size)
-        is_known = np.isfinite(sums)
-        variances = np.ma.array(sums, mask=~is_known).var(axis=1, ddof=1).filled(np.inf)
-        variances[is_known.mean(axis=1) <= 0.5] = np.inf
-        return float(np.median(variances, axis=0).max())
+    Infinite if half of the estimates at half of the points fail.
+    """
+    sums = np.add.reduceat(terms, starts, axis=1).reshape(-1, _N_SEEDS, starts.size)
+    is_known = np.isfinite(sums)
+    variances = np.ma.array(sums, mask=~is_known).var(axis=1, ddof=1).filled(np.inf)
+    variances[is_known.mean(axis=1) <= 0.5] = np.inf
+    return float(np.median(variances, axis=0).max())
 
 
 def _records_moved_alone(model: Model) -> dict[str, NDArray[np.int64]]:
@@ -288,13 +261,13 @@ def _second_number(measured: _Measured, low: float, high: float) -> int:
 
 
 def _suggestion(
-    first: _Measured, second: _Measured | None, low: float, high: float
+    first: _Measured, second: _Measured, low: float, high: float
 ) -> tuple[int | None, str]:
     """A number of particles whose variance lies in the range, and why; None if there is none.
 
     Between two measurements the variance is a power of the number, and beyond them that is -1.
     """
-    if second is None:
+    if second.n_particles == first.n_particles:
         return first.n_particles, f"the variance is {first}"
     found = f"the variance is {first} and {second}"
     if low <= second.variance <= high:
