@@ -54,8 +54,11 @@ def test_parts_of_a_compilation_and_what_a_bar_shows_have_no_line_of_their_own(t
     class Work:
         on_progress = None
 
-    with progress.row_progress(Work(), enabled=True, patience=0.0) as begin:
+    work = Work()
+    with progress.row_progress(work, enabled=True) as begin:
         begin("Pilot", 10)
+        sleep(0.2)
+        work.on_progress(1)
         with progress.slow_compilation("a filter"):
             sleep(0.3)
         begin("", 0)
