@@ -75,7 +75,7 @@ def _is_open(path):
 def _refusing_open_files(function):
     def call(path, *args, **kwargs):
         name = os.path.basename(os.fspath(path))
-        if not name.startswith("lease.") and _is_open(path):
+        if name != "run.lock" and _is_open(path):
             raise _error(errno.EACCES, path)
         return function(path, *args, **kwargs)
 

@@ -27,13 +27,13 @@ from tests.elsewhere import PLAIN
 from tests.waiting import LIMIT
 
 ROOT = Path(__file__).parents[1]
-# A run with a checkpoint that is resumed, leases and journals, cores, and interrupts.
+# A run with a checkpoint that is resumed, its files, cores, and interrupts.
 WITHOUT_LINUX = (
     "tests/runs_elsewhere.py",
     "tests/parallel/test_cpu_affinity.py",
-    "tests/sampling/test_folder_lease.py",
     "tests/sampling/test_interrupts.py",
     "tests/sampling/test_checkpoint_file.py",
+    "tests/sampling/test_checkpoint_folder.py",
 )
 on_linux = pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="nothing to take away")
 
@@ -42,7 +42,7 @@ on_linux = pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="noth
 def test_without_what_linux_has():
     command = [sys.executable, "-m", "pytest", "-q", "-p", "tests.elsewhere", "-p", "no:xdist"]
     # Slow and pure Python; and one whose child process has all of Linux.
-    named = "every_altered_byte", "truncated_segment", "segments_stay_few", "a_living_process"
+    named = "every_altered_byte", "torn_anywhere", "free_when_that_is_killed"
     left_out = "-k", " and ".join(f"not {name}" for name in named)
     done = subprocess.run(
         [*command, "-p", "no:cacheprovider", *left_out, *WITHOUT_LINUX],

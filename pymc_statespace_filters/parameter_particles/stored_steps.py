@@ -6,17 +6,16 @@ stored does not depend on the number of ranks.
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import numpy as np
 
 from ..parallel.shared_rows import by_first_rank
 from ..sampling.checkpoint.checkpoint import Checkpoint, checked_folder, open_checkpoint
-from ..sampling.checkpoint.journal import ChainJournal
 
 SECONDS = 5.0  # between two records
-_JOURNAL = "particles"
+_KEY = "particles"
 
 type Arrays = dict[str, np.ndarray]
 
@@ -30,16 +29,16 @@ class StoredSteps:
         The last step, on all ranks; empty at the beginning.
     """
 
-    def __init__(self, found: Arrays | None = None, journal: ChainJournal | None = None) -> None:
+    def __init__(self, found: Arrays | None = None, checkpoint: Checkpoint | None = None) -> None:
         self.found = found or {}
-        self._journal, self._saved_at = journal, time.monotonic()
+        self._checkpoint, self._saved_at = checkpoint, time.monotonic()
 
     def save(self, arrays: Callable[[], Arrays], *, is_last: bool = False) -> None:
         """Store a step if some seconds have passed, or if it is the last."""
-        if self._journal is None:
+        if self._checkpoint is None:
             return
         if is_last or time.monotonic() - self._saved_at >= SECONDS:
-            self._journal.append({}, arrays())
+            self._checkpoint.append(_KEY, {}, arrays())
             self._saved_at = time.monotonic()
 
 
@@ -52,21 +51,19 @@ def steps_stored_in(
     Raises
     ------
     DataMismatchError, ModelError, CheckpointError
-        As `open_checkpoint` and `ChainJournal.read`.
+        As `open_checkpoint` and `Checkpoint.read`.
     """
     if folder is None:
         yield StoredSteps()
         return
     opened: list[Checkpoint] = []
+    with ExitStack() as stack:
 
-    def begin() -> Arrays:
-        opened.append(open_checkpoint(checked_folder(folder), settings()))
-        stored = opened[0].journal(_JOURNAL).read()
-        return {} if stored is None else stored.state
+        def begin() -> Arrays:
+            checkpoint = open_checkpoint(checked_folder(folder), settings())
+            opened.append(stack.enter_context(checkpoint))
+            stored = checkpoint.read(_KEY)
+            return {} if stored is None else stored.state
 
-    try:
         found = by_first_rank(begin)
-        yield StoredSteps(found, opened[0].journal(_JOURNAL) if opened else None)
-    finally:
-        for checkpoint in opened:
-            checkpoint.close()
+        yield StoredSteps(found, *opened)

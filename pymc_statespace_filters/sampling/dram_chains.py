@@ -134,7 +134,7 @@ def sample_dram(
     checkpoint : str or path, optional
         A folder in which the chains are stored every few seconds. If the process ends for any
         reason, the same call resumes the run and returns bitwise the same draws as an uninterrupted
-        one. With ``comm``, the folder must be visible to all ranks.
+        one. With ``comm``, the first rank alone reads and writes it.
     comm : mpi4py.MPI.Comm, "world" or Ranks, optional
         Ranks over which the chains are distributed; all of them make this call. "world" is all
         ranks started by ``mpiexec``, or this process alone without ``mpiexec``. `Ranks` says more:

@@ -9,6 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 import pymc as pm
+from mpi4py import MPI
 from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
 
@@ -82,7 +83,9 @@ def long_run(folder: str, iterations: str = "inf") -> None:
 
     chain_task.ChainTask._advance = advance
     chain_task.CHECKPOINT_SECONDS = 0.0
-    tree = resumed(checkpoint=Path(folder, "run"), comm="world")
+    # Only the first rank sees the folder.
+    name = "not-seen" if MPI.COMM_WORLD.rank else "run"
+    tree = resumed(checkpoint=Path(folder, name), comm="world")
     if tree is not None:
         draws = {name: tree["posterior"][name].values for name in tree["posterior"].data_vars}
         Path(folder, "draws").write_bytes(pickle.dumps(draws))

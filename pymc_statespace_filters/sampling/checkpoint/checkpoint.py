@@ -1,72 +1,78 @@
-"""Checkpoints: a folder with the settings of a run, and the stored draws and states of its chains.
+"""Checkpoints: a folder with one file of a run, its settings and then its stored draws and states.
 
-The settings are written once (see `manifest`), and stored chains are immutable files (see
-`journal`); each file appears whole. So a process that is killed at any moment leaves a folder that
-is not yet a checkpoint, or a good one up to the last record.
-
-Several ranks use one folder that all of them see: the first opens it, and the others join with its
-ticket. When a job has died, one of its ranks may still be writing while the next job opens the
-folder. Two things prevent damage: a rank checks the lease of its job before it writes, and each job
-moves the files to a new subfolder and removes the former one, so that a write in progress fails.
+One process writes to it. Of several ranks that is the first, to which the others send what they
+have to store, so that only the first has to see the folder.
 """
 
+import json
 import os
-import platform
 import re
-import shutil
 import unicodedata
 from collections.abc import Mapping
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
-from ...errors import ModelError
-from .journal import ChainJournal, sync_folder
-from .lease import FolderLease, becomes_visible, check_held
-from .manifest import canonical, write_or_compare
+from filelock import FileLock
 
+from ...errors import DataMismatchError, ModelError
+from .arrays import Arrays, Stored, encoded
+from .lock import locked
+from .record_file import RecordFile, header_of
+
+_FILE = "run.checkpoint"
+_MAX_SHOWN = 80  # characters of a value in a message
+_CURE = "delete the folder or give another path"
 _MAX_READABLE = 40  # characters of a name
 
 
-class Ticket(NamedTuple):
-    """What another rank needs to join a checkpoint; it can be pickled."""
-
-    folder: str
-    lease: str
-    settings: str
-
-
 class Checkpoint:
-    """An open checkpoint; a context manager that releases the folder at its end.
+    """An open checkpoint, made by `open_checkpoint`; a context manager that releases the folder.
 
-    Made by `open_checkpoint`, or by `join_checkpoint` on other ranks, which release nothing. Other
-    ranks join with the ``ticket``, until this checkpoint is closed.
+    What is stored has a key: ``chain 0``, for example.
     """
 
-    def __init__(self, ticket: Ticket, lease: FolderLease | None = None):
-        self.path, self.ticket = Path(ticket.folder), ticket
-        self._lease = lease
-        self._journals: dict[int | str, ChainJournal] = {}
+    def __init__(self, records: RecordFile, lock: FileLock):
+        self._records, self._lock = records, lock
 
-    def journal(self, chain: int | str) -> ChainJournal:
-        """The journal of a chain, 0 the first, or of "starts" or "length"; always the same object.
+    def read(self, key: str) -> Stored | None:
+        """All draws under a key, and the last state; None if there is nothing.
 
-        One rank at a time uses the journal of a chain, and begins with `ChainJournal.read`.
+        Raises
+        ------
+        CheckpointError
+            If the file cannot be read, or was damaged since it was opened.
         """
-        if chain not in self._journals:
-            path = _subfolder_of(self.path / self.ticket.lease) / f"chain-{chain}"
-            origin = f"{self.ticket.settings}\n{chain}".encode()
-            self._journals[chain] = ChainJournal(path, origin, self.check)
-        return self._journals[chain]
+        return self._records.read(key) if key in self._records else None
 
-    def check(self) -> None:
-        """Raise a `ModelError` if another job has taken the folder over."""
-        check_held(self.path / self.ticket.lease)
+    def append(self, key: str, draws: Arrays, state: Arrays) -> None:
+        """Write one record; when this returns, it is on the disk.
+
+        Parameters
+        ----------
+        key : str
+        draws : mapping of str to ndarray, shape (new draws, ...)
+            The draws since the last record, under the same names each time; numbers or booleans.
+        state : mapping of str to ndarray
+            The whole state after them.
+
+        Raises
+        ------
+        CheckpointError
+            If the record cannot be written, for example because the disk is full. It is then not
+            there, and those before it are.
+        ValueError
+            If an array has Python objects.
+        """
+        self._records.append(encoded(key, draws, state))
+
+    def append_encoded(self, content: bytes) -> None:
+        """Write a record that another rank has sent, made by `encoded`."""
+        self._records.append(content)
 
     def close(self) -> None:
         """Release the folder."""
-        if self._lease is not None:
-            self._lease.release()
+        self._lock.release()
 
     def __enter__(self) -> Self:
         return self
@@ -95,9 +101,8 @@ def open_checkpoint(path: str | os.PathLike, settings: Mapping[str, Any]) -> Che
         If the checkpoint is of a run with other settings; the message names every field that
         differs, with both values.
     ModelError
-        If the folder cannot be used: it is something else, damaged, of another format, not
-        writable, or in use by another process. A process of another computer, or of another
-        container, is watched for 20 s before its folder is taken over.
+        If the folder cannot be used: it is a file, not writable, in use by another process, or its
+        checkpoint is damaged at its beginning or of another format.
 
     Examples
     --------
@@ -105,23 +110,23 @@ def open_checkpoint(path: str | os.PathLike, settings: Mapping[str, Any]) -> Che
     >>> import numpy as np
     >>> folder = tempfile.TemporaryDirectory()
     >>> with open_checkpoint(folder.name, {"draws": 4}) as checkpoint:
-    ...     checkpoint.journal(0).append({"x": np.zeros(2)}, {"iteration": np.array(2)})
+    ...     checkpoint.append("chain 0", {"x": np.zeros(2)}, {"iteration": np.array(2)})
     >>> with open_checkpoint(folder.name, {"draws": 4}) as checkpoint:
-    ...     draws, state = checkpoint.journal(0).read()
+    ...     draws, state = checkpoint.read("chain 0")
     >>> draws["x"].size, int(state["iteration"])
     (2, 2)
     >>> folder.cleanup()
     """
-    folder = Path(path).absolute()
-    text = canonical(dict(settings))
+    folder, header = Path(path).absolute(), _canonical(dict(settings))
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        lease = FolderLease(folder)
+        lock = locked(folder)
         try:
-            write_or_compare(folder, text)
-            _take_chains(folder, lease.path)
+            if (folder / _FILE).exists():
+                _check_same(folder, json.loads(header))
+            return Checkpoint(RecordFile(folder / _FILE, header), lock)
         except BaseException:
-            lease.release()
+            lock.release()
             raise
     except FileExistsError as error:  # on Windows, also of a folder above
         raise ModelError(f"checkpoint={error.filename!r} is a file: expected a folder") from None
@@ -132,38 +137,6 @@ def open_checkpoint(path: str | os.PathLike, settings: Mapping[str, Any]) -> Che
             f"checkpoint={str(folder)!r} cannot be written to ({error.strerror}{at}): give another "
             "path"
         ) from error
-    return Checkpoint(Ticket(str(folder), lease.path.name, text), lease)
-
-
-def join_checkpoint(ticket: Ticket) -> Checkpoint:
-    """Open a checkpoint on a rank other than the first, with the ticket of the first.
-
-    It gives the journals of the chains that this rank runs, as long as the first rank has the
-    folder open.
-
-    Raises
-    ------
-    ModelError
-        If the folder of that name here is another one: the first rank's lease is not in it. On a
-        network a file may become visible late, so this takes a minute.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> folder = tempfile.TemporaryDirectory()
-    >>> with open_checkpoint(folder.name, {"draws": 4}) as first:
-    ...     with join_checkpoint(first.ticket) as second:
-    ...         second.path == first.path
-    True
-    >>> folder.cleanup()
-    """
-    if not becomes_visible(Path(ticket.folder, ticket.lease)):
-        raise ModelError(
-            f"checkpoint={ticket.folder!r} is not on a file system that all ranks see: "
-            f"{platform.node()} does not find {ticket.lease}, which the first rank has written "
-            f"there; give a path on a shared file system"
-        )
-    return Checkpoint(ticket)
 
 
 def folder_name(name: str) -> str:
@@ -183,27 +156,39 @@ def folder_name(name: str) -> str:
     return f"{readable}-{digest}".removeprefix("-")
 
 
-def _subfolder_of(lease: Path) -> Path:
-    """Where the job of a lease has its chains."""
-    return lease.with_name(f"chains{lease.suffix}")
-
-
-def _take_chains(folder: Path, lease: Path) -> None:
-    """Move the chains of former jobs to the subfolder of this one."""
-    current = _subfolder_of(lease)
-    current.mkdir()
-    for former in folder.glob("chains.*"):
-        if former != current:
-            for path in former.glob("*.segment"):
-                path.rename(current / path.name)
-            check_held(lease)
-            shutil.rmtree(former)  # with unfinished files
-    sync_folder(current)
-    sync_folder(folder)
-
-
 def checked_folder(checkpoint: Any) -> str | os.PathLike:
     """The folder of a checkpoint, as the user gave it; a `ModelError` if it is no path."""
     if not isinstance(checkpoint, str | os.PathLike) or not os.fspath(checkpoint):
         raise ModelError(f"checkpoint must be the path of a folder, got {checkpoint!r}")
     return checkpoint
+
+
+def _check_same(folder: Path, now: dict[str, Any]) -> None:
+    """Raise unless the checkpoint in a folder has these settings."""
+    try:
+        stored = json.loads(header_of(folder / _FILE))
+    except ValueError as error:
+        raise ModelError(f"checkpoint={str(folder)!r}: its {_FILE} {error}; {_CURE}") from None
+    differing = [
+        f"{name}: the checkpoint has {_shown(stored, name)}, this run has {_shown(now, name)}"
+        for name in dict.fromkeys([*stored, *now])
+        if name not in stored
+        or name not in now
+        or _canonical(stored[name]) != _canonical(now[name])
+    ]
+    if differing:
+        raise DataMismatchError(
+            f"checkpoint={str(folder)!r} is of another run: {'; '.join(differing)}; {_CURE}"
+        )
+
+
+def _canonical(value: Any) -> str:
+    """One text for equal JSON values; 1, 1.0 and True differ, NaN equals itself."""
+    return json.dumps(value, sort_keys=True)
+
+
+def _shown(values: Mapping[str, Any], name: str) -> str:
+    if name not in values:
+        return "nothing"
+    text = _canonical(values[name])
+    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."

@@ -12,7 +12,7 @@ from threading import Event
 import numpy as np
 
 from ...facts import tell
-from ..checkpoint.checkpoint import Checkpoint
+from ..checkpoint.arrays import Arrays, Stored
 from ..kernel.state import (
     N_DONE,
     N_FAILED,
@@ -35,6 +35,7 @@ from .thinned_draws import Thinning
 CHECKPOINT_SECONDS = 5.0
 
 Candidates = Callable[[np.random.Generator], Sequence[np.ndarray]]
+Store = Callable[[Arrays, Arrays], None]  # of new draws, and the state after them
 
 
 class ChainTask:
@@ -65,7 +66,10 @@ class ChainTask:
         Number of the chain.
     name : str, optional
         For messages. Default: "chain" and the index.
-    checkpoint : Checkpoint, optional
+    stored : Stored, optional
+        What a former call has stored of the chain.
+    store : callable, optional
+        Stores new draws and the state after them.
     keeps_warmup : bool
     measures_noise : bool
         Whether the variance of the estimated log-likelihood is measured at the start.
@@ -88,7 +92,8 @@ class ChainTask:
         proposal_cov: np.ndarray | None = None,
         index: int = 0,
         name: str | None = None,
-        checkpoint: Checkpoint | None = None,
+        stored: Stored | None = None,
+        store: Store | None = None,
         keeps_warmup: bool = False,
         measures_noise: bool = False,
         former: tuple[ChainState, int] | None = None,
@@ -111,8 +116,8 @@ class ChainTask:
         if former is not None:
             state, self._first = former
             self.chain.load_state(state)
-        self._log = None if checkpoint is None else checkpoint.journal(index)
-        if self._log is not None and (stored := self._log.read()) is not None:
+        self._store = store
+        if stored is not None:
             self.chain.restore(*stored)
         self._n_saved = self.n_done
         self._is_resumed = self.n_done > 0
@@ -226,10 +231,10 @@ class ChainTask:
 
     def _must_save(self) -> bool:
         due = time.monotonic() - self._saved_at >= CHECKPOINT_SECONDS
-        return self._log is not None and due and self.n_done > self._n_saved
+        return self._store is not None and due and self.n_done > self._n_saved
 
     def _save(self) -> None:
-        if self._log is not None and self.n_done > self._n_saved:
-            self._log.append(*self.chain.snapshot(self._n_saved))
+        if self._store is not None and self.n_done > self._n_saved:
+            self._store(*self.chain.snapshot(self._n_saved))
             self._n_saved = self.n_done
         self._saved_at = time.monotonic()

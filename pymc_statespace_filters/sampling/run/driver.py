@@ -28,7 +28,7 @@ from ...parallel.agreement import check_same_call
 from ...parallel.communicator import Communicator, communicator_of
 from ...parallel.cpu_affinity import allowed_cores, cores_per_process
 from ...parallel.signals import keeps_what_is_there
-from ..checkpoint.checkpoint import join_checkpoint, open_checkpoint
+from ..checkpoint.checkpoint import open_checkpoint
 from ..output.facts import WithoutDraws
 from ..target.leader_follower import follow, release_followers
 from .model_task import ModelTask
@@ -186,23 +186,16 @@ def _open_checkpoints(
     comm: Communicator,
     stack: ExitStack,
 ) -> None:
-    """Open the folders on rank 0, and join them on the others."""
+    """Open the folders on rank 0, which stores what the others send."""
 
-    def open_all() -> list:
-        tickets: list = []
-        if comm.rank == 0:
-            for task, folder in zip(tasks, folders, strict=True):
-                key = task.request.cache_key(task.model)
-                task.checkpoint = stack.enter_context(open_checkpoint(folder, key))
-                tickets.append(task.checkpoint.ticket)
-        return tickets
-
-    def join_all(tickets: list) -> None:
+    def opened() -> list:
         if comm.rank > 0:
-            for task, ticket in zip(tasks, tickets, strict=True):
-                task.checkpoint = stack.enter_context(join_checkpoint(ticket))
+            return []
+        for task, folder in zip(tasks, folders, strict=True):
+            key = task.request.cache_key(task.model)
+            task.checkpoint = stack.enter_context(open_checkpoint(folder, key))
+        return [task.stored_length() for task in tasks]
 
-    comm.run_collectively(partial(join_all, comm.broadcast(comm.run_collectively(open_all))))
-    lengths = comm.run_collectively(lambda: [t.stored_length() for t in tasks if comm.rank == 0])
-    for task, length in zip(tasks, comm.broadcast(lengths), strict=True):
+    lengths = comm.broadcast(comm.run_collectively(opened))
+    for task, length in zip(tasks, lengths, strict=True):
         task.set_length(length)

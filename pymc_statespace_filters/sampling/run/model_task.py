@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from pymc.model import Model
@@ -10,6 +10,7 @@ from xarray import DataTree
 
 from ...parallel.communicator import Communicator
 from ...parallel.signals import unless_interrupted
+from ..checkpoint.arrays import Stored
 from ..checkpoint.checkpoint import Checkpoint
 from ..kernel.state import ChainState, Draws
 from ..output.convergence import Convergence, convergence
@@ -19,7 +20,7 @@ from ..target.initial_points import chain_candidates
 from ..target.record_target import RecordTarget, target_of
 from ..target.target import Target
 from ..target.variables import check_no_generators
-from .chain_task import ChainTask
+from .chain_task import ChainTask, Store
 from .model_result import ModelResult
 from .population_search import (
     SearchedPoints,
@@ -35,6 +36,13 @@ from .thinned_draws import Thinning
 # Draws of each chain from which diagnostics are computed while chains run; of ten parameters this
 # takes a tenth of a second.
 _MOST_LIVE_DRAWS = 4000
+
+_LENGTH = "length"  # key in the checkpoint
+
+
+def key_of_chain(index: int) -> str:
+    """The key of a chain in the checkpoint of its model."""
+    return f"chain {index}"
 
 
 class ModelTask:
@@ -111,9 +119,16 @@ class ModelTask:
             self._measures_noise = is_measured(target, request.n_iterations)
         return self._target
 
-    def chain_task(self, index: int) -> ChainTask:
-        """Make the task of a chain, from its start or from its checkpoint."""
-        target, request = self.prepare(), self.request
+    def chain_task(
+        self, index: int, stored: Stored | None = None, store: Store | None = None
+    ) -> ChainTask:
+        """Make the task of a chain, from its start or from its checkpoint.
+
+        Where this rank has no checkpoint, ``stored`` and ``store`` are as `ChainTask` takes them.
+        """
+        target, request, key = self.prepare(), self.request, key_of_chain(index)
+        if self.checkpoint is not None:
+            stored, store = self.checkpoint.read(key), partial(self.checkpoint.append, key)
         population = self.population if request.initvals is None else None
         cov = None
         if isinstance(target, Target):
@@ -130,7 +145,8 @@ class ModelTask:
             former=request.former and (request.former.states[index], request.former.iterations),
             index=index,
             name=f"chain {index} of model {self.name!r}" if self.name else None,
-            checkpoint=self.checkpoint,
+            stored=stored,
+            store=store,
             keeps_warmup=request.keeps_warmup,
             measures_noise=self._measures_noise,
             population=population,
@@ -238,13 +254,13 @@ class ModelTask:
         """The length to which the chains of the checkpoint were to go on, if there is one."""
         stored = None
         if self.checkpoint is not None and self.request.doubles_thin:
-            stored = self.checkpoint.journal("length").read()
+            stored = self.checkpoint.read(_LENGTH)
         return self.length if stored is None else Length(*stored.draws["length"][-1].tolist())
 
     def _store_length(self) -> None:
         """Store the length in the checkpoint: coarser draws do not show why they went on."""
         if self.checkpoint is not None and self.request.doubles_thin:
-            self.checkpoint.journal("length").append({"length": np.array([self.length])}, {})
+            self.checkpoint.append(_LENGTH, {"length": np.array([self.length])}, {})
 
     @property
     def mixture(self) -> np.ndarray:

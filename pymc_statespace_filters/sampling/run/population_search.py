@@ -22,6 +22,7 @@ from ..target.target import MANY_DIMENSIONS, Target
 from .request import SamplingRequest
 
 _NO_CHAIN = 2**32 - 1
+_STARTS = "starts"  # key in the checkpoint
 
 _UNUSABLE_PILOT = (
     "a pilot that lacks free variables of the model needs tune of at least 1, priors that can be "
@@ -144,8 +145,7 @@ def search_population(
         if pilot is not None:
             raise ModelError(begin + _UNUSABLE_PILOT)
         return None
-    journal = None if checkpoint is None else checkpoint.journal("starts")
-    if journal is not None and (stored := journal.read()) is not None:
+    if checkpoint is not None and (stored := checkpoint.read(_STARTS)) is not None:
         return SearchedPoints(stored.draws["population"], float(stored.state["level"]))
     try:
         found = find_population(
@@ -160,8 +160,8 @@ def search_population(
         raise
     tell(SeparateModes(model, target.raveled, found), begin)
     level, noise = float(np.median(found.log_density)), []
-    if journal is not None:
-        journal.append({"population": found.x}, {"level": np.array(level)})
+    if checkpoint is not None:
+        checkpoint.append(_STARTS, {"population": found.x}, {"level": np.array(level)})
     if is_measured(target, request.n_iterations):
         noise = tell(NoisyStarts(model, target, found, generator_of(request, 0, 1)), begin)
     return SearchedPoints(found.x, level, bool(noise))

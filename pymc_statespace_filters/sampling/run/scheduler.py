@@ -1,8 +1,9 @@
 """Scheduling of chains over ranks: rank 0 manages them and runs some, the others ask for work.
 
 All messages go between rank 0 and one other rank, from the main thread of each; chains run in
-threads and send nothing. A chain's draws depend on its model and number alone, not on the rank that
-runs it.
+threads and send nothing. Rank 0 alone reads and writes checkpoints: with a chain it sends what is
+stored of it, and it is sent what a chain has to store. A chain's draws depend on its model and
+number alone, not on the rank that runs it.
 
 Chains end more than once: after each part of the warm-up, and with ``until_ess``. Rank 0 waits for
 all chains of a model, fits the mixture that they draw proposals from, and lets them go on, each on
@@ -17,28 +18,23 @@ import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
 
 import numpy as np
 
 from ...errors import ParallelError
-from ...parallel.communicator import ABORT_GRACE_SECONDS, Communicator, describe_error
+from ...parallel.communicator import Communicator, describe_error
 from ...parallel.signals import ignored_interrupts, interrupts_are_noted, takes_interrupt
 from ...progress import ChainProgress
+from ..checkpoint.arrays import encoded
 from ..kernel.state import ChainState, Draws
 from .chain_task import ChainTask
-from .model_task import ModelTask
+from .messages import LISTENING_SECONDS, Kind, place_of
+from .model_task import ModelTask, key_of_chain
 from .thread_pool import ChainPool
-
-# Kinds of messages: to rank 0, ...
-_IDLE, _PROGRESS, _RESULT, _FAILED, _LEAVING = "idle", "progress", "result", "failed", "leaving"
-# ... and from it.
-_CHAIN, _GO_ON, _NO_MORE, _STOP, _OVER = "chain", "go on", "no more", "stop", "over"
+from .worker import Worker
 
 _ALONE_SECONDS = 0.1
-_LISTENING_SECONDS = 0.02
-_PROGRESS_SECONDS = 0.25
-_ANSWER_SECONDS = 10.0
+_MOST_BYTES = 2**28  # of one message
 
 # Seconds between two computations, and the part of the time that they may take.
 _SECONDS, _SHARE = 2.0, 0.01
@@ -63,7 +59,7 @@ def run_chains(
     with ChainPool(n_threads) as pool:
         if comm.rank > 0:
             with ignored_interrupts():
-                _Worker(tasks, comm, pool).run()
+                Worker(tasks, comm, pool).run()
             return
         with _release_workers(comm):
             _Manager(tasks, comm, pool, progressbar).run()
@@ -76,15 +72,9 @@ def _release_workers(comm: Communicator) -> Iterator[None]:
         yield
     except BaseException as error:
         message = f"rank 0 of {comm.size} has stopped the run: {describe_error(error)}"
-        comm.send_to_others(_OVER, str(error) if isinstance(error, ParallelError) else message)
+        comm.send_to_others(Kind.OVER, str(error) if isinstance(error, ParallelError) else message)
         raise
-    comm.send_to_others(_OVER)
-
-
-def _chain_task(tasks: Sequence[ModelTask], number: int) -> ChainTask:
-    """The task of a chain; chains are numbered through all models."""
-    model, chain = divmod(number, tasks[0].request.chains)
-    return tasks[model].chain_task(chain)
+    comm.send_to_others(Kind.OVER)
 
 
 class _Manager:
@@ -125,9 +115,9 @@ class _Manager:
             self._add_result(number, *task.result())
         self._schedule.clear()
         if self._n_unfinished:
-            self._comm.send_to_others(_STOP)
+            self._comm.send_to_others(Kind.STOP)
         while self._workers:
-            time.sleep(_LISTENING_SECONDS)
+            time.sleep(LISTENING_SECONDS)
             self._receive()
         for model_task in self._tasks:
             model_task.load_missing_results()
@@ -157,14 +147,15 @@ class _Manager:
             if goal is not None:
                 self._bars.extend(number, task.n_iterations)
             if number in self._rank_of:
-                self._comm.send(self._rank_of[number], _GO_ON, (number, goal))
+                self._comm.send(self._rank_of[number], Kind.GO_ON, (number, goal))
             else:
                 self._pool.go_on(number, goal)
 
     def _continue(self) -> None:
         while self._pool.is_idle and (number := self._next()) is not None:
-            self._pool.start(number, _chain_task(self._tasks, number))
-        seconds = _LISTENING_SECONDS if self._workers else _ALONE_SECONDS
+            model_task, chain = place_of(self._tasks, number)
+            self._pool.start(number, model_task.chain_task(chain))
+        seconds = LISTENING_SECONDS if self._workers else _ALONE_SECONDS
         for number, task in self._pool.finished(seconds):
             self._show(number, task)
             self._pool.ended[number] = task
@@ -182,116 +173,43 @@ class _Manager:
         """Handle the messages of the workers."""
         while (message := self._comm.receive()) is not None:
             source, kind, value = message
-            if kind == _IDLE:
-                number = self._next()
-                self._comm.send(source, _NO_MORE if number is None else _CHAIN, number)
-            elif kind == _PROGRESS:
+            if kind == Kind.IDLE:
+                self._send_chain(source)
+            elif kind == Kind.PROGRESS:
                 for progress in value:
                     self._bars.update(*progress)
-            elif kind == _RESULT:
+            elif kind == Kind.RECORD:
+                number, content = value
+                task, _ = place_of(self._tasks, number)
+                if task.checkpoint is not None:
+                    task.checkpoint.append_encoded(content)
+            elif kind == Kind.RESULT:
                 number, layout, state = value
                 draws = Draws(**{name: np.empty(*of_array) for name, of_array in layout.items()})
                 self._comm.receive_arrays(source, draws)
                 self._rank_of[number] = source
                 self._add_result(number, draws, state)
-            elif kind == _LEAVING:
+            elif kind == Kind.LEAVING:
                 self._workers.discard(source)
-            elif kind == _FAILED:
+            elif kind == Kind.FAILED:
                 self._workers.discard(source)
                 raise ParallelError(
                     f"rank {source} of {self._comm.size} has stopped the run: {value}"
                 )
 
-
-class _StoppedByOthers(Exception):
-    """Another rank has failed; the message names it and its error."""
-
-
-class _Worker:
-    """Any other rank."""
-
-    def __init__(self, tasks: Sequence[ModelTask], comm: Communicator, pool: ChainPool):
-        self._tasks, self._comm, self._pool = tasks, comm, pool
-        self._expects_more = True
-        self._has_asked = self._has_left = self._is_over = False
-        self._reported_at = time.monotonic()
-
-    def run(self) -> None:
-        """Run the chains that rank 0 assigns, until the run is over."""
-        try:
-            while not self._is_over:
-                self._continue()
-                has_chains = self._pool.running or self._pool.ended
-                if not (self._expects_more or has_chains or self._has_left):
-                    self._comm.send(0, _LEAVING)
-                    self._has_left = True
-        except _StoppedByOthers as stopped:
-            self._pool.stop()
-            time.sleep(ABORT_GRACE_SECONDS)
-            raise ParallelError(str(stopped)) from None
-        except BaseException as error:
-            self._pool.stop()
-            self._comm.send(0, _FAILED, describe_error(error))
-            self._wait_for_answer()
-            error.add_note(f"on rank {self._comm.rank} of {self._comm.size}")
-            raise
-
-    def _continue(self) -> None:
-        if self._expects_more and not self._has_asked and self._pool.is_idle:
-            self._comm.send(0, _IDLE)
-            self._has_asked = True
-        for number, task in self._pool.finished(_LISTENING_SECONDS):
-            self._report({number: task})
-            self._send_result(number, task)
-            self._pool.ended[number] = task
-        if time.monotonic() - self._reported_at > _PROGRESS_SECONDS:
-            self._report(self._pool.running)
-            self._reported_at = time.monotonic()
-        while (message := self._comm.receive()) is not None:
-            self._handle(message.kind, message.value)
-
-    def _handle(self, kind: str, value: Any) -> None:
-        if kind == _CHAIN:
-            self._has_asked = False
-            self._pool.start(value, _chain_task(self._tasks, value))
-        elif kind == _GO_ON:
-            self._pool.go_on(*value)
-        elif kind == _NO_MORE:
-            self._expects_more = False
-        elif kind == _OVER and isinstance(value, str):
-            raise _StoppedByOthers(value)
-        elif kind == _OVER:
-            self._is_over = True
-        elif kind == _STOP:  # the user has interrupted
-            self._expects_more = False
-            self._pool.stop()
-            self._pool.ended.clear()
-            while self._pool.running:
-                self._send_result(*self._pool.running.popitem())
-
-    def _report(self, tasks: Mapping[int, ChainTask]) -> None:
-        progress = [
-            (number, task.n_done, task.progress(), task.seconds)
-            for number, task in tasks.items()
-            if task.n_done > 0
-        ]
-        if progress:
-            self._comm.send(0, _PROGRESS, progress)
-
-    def _send_result(self, number: int, task: ChainTask) -> None:
-        draws, state = task.result()
-        layout = {name: (a.shape, a.dtype.str) for name, a in draws._asdict().items()}
-        self._comm.send(0, _RESULT, (number, layout, state))
-        self._comm.send_arrays(0, draws)
-
-    def _wait_for_answer(self) -> None:
-        """Wait until rank 0 has received the error: the first rank to end may end the job."""
-        until = time.monotonic() + _ANSWER_SECONDS
-        while time.monotonic() < until:
-            message = self._comm.receive()
-            if message is not None and message.kind == _OVER:
-                return
-            time.sleep(_LISTENING_SECONDS)
+    def _send_chain(self, to: int) -> None:
+        """Send the chain that is to run next, with what is stored of it; or that there is none."""
+        if (number := self._next()) is None:
+            self._comm.send(to, Kind.NO_MORE)
+            return
+        task, chain = place_of(self._tasks, number)
+        if task.checkpoint is not None:
+            key = key_of_chain(chain)
+            if (stored := task.checkpoint.read(key)) is not None:
+                content = encoded(key, *stored)
+                for begin in range(0, len(content), _MOST_BYTES):
+                    self._comm.send(to, Kind.STORED, content[begin : begin + _MOST_BYTES])
+        self._comm.send(to, Kind.CHAIN, (number, task.checkpoint is not None))
 
 
 class ConvergenceDisplay:
