@@ -16,6 +16,7 @@ from pytensor.compile.ops import wrap_py
 import pymc_statespace_filters as psf
 from pymc_statespace_filters import rivals as rivals_module
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
+from pymc_statespace_filters.sampling.checkpoint.record_file import RecordFile, header_of
 from pymc_statespace_filters.sampling.run import model_result
 from pymc_statespace_filters.sampling.run.model_task import ModelTask
 from pymc_statespace_filters.sampling.run.request import RunArguments, SamplingRequest
@@ -98,12 +99,9 @@ def test_an_interrupted_study_goes_on(models, tmp_path, monkeypatch):
         interrupt_chains(patch)
         with pytest.raises(KeyboardInterrupt, match="before there was a draw"):  # in the warm-up
             psf.run_models(models, **settings)
-    stored = [
-        {segment.name.partition(".")[0] for segment in folder.rglob("*.segment")}
-        for folder in sorted(tmp_path.iterdir())
-    ]
-    begun = {"chain-starts", "chain-0", "chain-1"}
-    assert sorted(stored, key=len) == [{"chain-starts"}, begun]  # one had not begun
+    files = [RecordFile(path, header_of(path)) for path in tmp_path.glob("*/run.checkpoint")]
+    stored = [{key for key in ("starts", "chain 0", "chain 1") if key in file} for file in files]
+    assert sorted(map(len, stored)) == [1, 3]  # one had not begun
     trees = psf.run_models(models, **settings)
     for name in models:
         assert_identical(trees[name], expected[name])
@@ -182,7 +180,7 @@ def test_a_result_takes_little_more_than_twice_its_memory(monkeypatch):
 
     settings = SETTINGS | {"draws": 40_000, "chains": 4}
     psf.sample_dram(model=model, **SETTINGS)
-    monkeypatch.setattr(model_result, "log_warnings", before_the_checks)
+    monkeypatch.setattr(model_result, "tell", before_the_checks)
     thresholds = gc.get_threshold()
     gc.set_threshold(700, 10, 10)  # a user's, not those of the tests
     tracemalloc.start()
