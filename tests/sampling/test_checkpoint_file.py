@@ -345,15 +345,15 @@ def test_another_version_is_refused(tmp_path):
 
 
 def test_another_file_of_that_name_is_refused_and_left_alone(tmp_path):
-    (tmp_path / "run.checkpoint").write_text("something else")
+    (tmp_path / "run.checkpoint").write_text("something else", encoding="utf-8")
     with pytest.raises(ModelError, match=r"its run\.checkpoint is damaged or not of a checkpoint"):
         open_checkpoint(tmp_path, SETTINGS)
-    assert (tmp_path / "run.checkpoint").read_text() == "something else"
+    assert (tmp_path / "run.checkpoint").read_text(encoding="utf-8") == "something else"
 
 
 def test_paths_that_cannot_be_folders_are_refused(tmp_path):
     file = tmp_path / "draws.nc"
-    file.write_text("x")
+    file.write_text("x", encoding="utf-8")
     with pytest.raises(ModelError, match=r"draws.nc' is a file: expected a folder"):
         open_checkpoint(file, SETTINGS)
     with pytest.raises(ModelError, match=INSIDE_FILE):

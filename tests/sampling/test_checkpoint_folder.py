@@ -78,7 +78,7 @@ def test_a_fork_does_not_free_the_folder_of_its_parent(tmp_path):
 def test_an_owner_on_another_computer_is_waited_for(tmp_path, monkeypatch, ends):
     """A server keeps the lock of a computer that has failed for a while."""
     held = open_checkpoint(tmp_path, SETTINGS)
-    (tmp_path / "run.owner").write_text("process 12 on node7")
+    (tmp_path / "run.owner").write_text("process 12 on node7", encoding="utf-8")
     waited, acquire = [], FileLock.acquire
 
     def in_time(self, timeout, **settings):
