@@ -118,7 +118,7 @@ def opened_without_encoding(file):
             if not is_open and not is_text:
                 continue
             call = ast.unparse(node)
-            if is_open and not re.search("'[rwax]b'", call):
+            if is_open and not re.search(r"'[rwax]\+?b'", call):
                 is_text = True
             if is_text and "encoding=" not in call:
                 yield f"{file.relative_to(ROOT).as_posix()}:{node.lineno}"
