@@ -31,8 +31,7 @@ from .estimates import Sampler, Visits, Weighted
 from .inclusion import InclusionPrior
 from .maxima import Maxima, Maximum, proposal_by
 from .proposals import Guide
-from .screening import GOOD, REACH, Announce, improved, proposals_of, screened
-from .unused import Uses
+from .screening import GOOD, REACH, Announce, improved, screened
 
 N_CHAINS, N_STEPS, N_DROPPED = 4, 1000, 200  # the first steps are dropped
 STARTS = (1.0, 2.0, 3.0)  # standard deviations from where a term vanishes, to be present at first
@@ -50,14 +49,12 @@ class _Met:
         self,
         prior: InclusionPrior,
         guide: Guide,
-        uses: Uses,
         sampler: Sampler,
         rng: np.random.Generator,
         maxima: Maxima | None,
     ) -> None:
-        self._prior, self._guide, self._uses = prior, guide, uses
+        self._prior, self._guide, self._maxima = prior, guide, maxima
         self._sampler, self._rng = sampler, rng
-        self._maxima = maxima
         self._found: dict[bytes, list[Maximum]] = {}
         self._highest = -np.inf
         self._pilots: dict[bytes, Weighted] = {}
@@ -98,7 +95,7 @@ class _Met:
         if not new:
             return
         sets = np.array([one for one, _ in new.values()])
-        first = proposals_of(sets, self._guide, self._uses, self._sampler)
+        first = [self._guide.proposal(one) for one in sets]
         log_prior = self._prior.log_weight(sets)
         if self._maxima is not None:
             least = self._highest - log_prior - REACH - MARGIN
@@ -133,7 +130,6 @@ def _count(pilot: Weighted) -> int:
 def run_chains(
     prior: InclusionPrior,
     guide: Guide,
-    uses: Uses,
     sampler: Sampler,
     rng: np.random.Generator,
     announce: Announce,
@@ -143,7 +139,7 @@ def run_chains(
 
     With ``maxima`` the proposal densities do without the guide.
     """
-    met = _Met(prior, guide, uses, sampler, rng, maxima)
+    met = _Met(prior, guide, sampler, rng, maxima)
     at, seen = _starts(prior, guide, maxima is None), _Seen()
     seen.note(range(N_CHAINS), at)
     height = met.heights(at, at)

@@ -84,11 +84,6 @@ class SubmodelDensity:
         """As of `SwitchedDensity`."""
         return self.density.blocks
 
-    @property
-    def n_blocks(self) -> int:
-        """How many there are."""
-        return int(self.blocks.max()) + 1
-
     def fresh_seeds(self, count: int, rng: np.random.Generator) -> Seeds:
         """Seeds of independent noise for so many points."""
         size = (count, len(self.density.seed_names))

@@ -1,6 +1,7 @@
 """Why probabilities of terms may be less certain than their errors suggest."""
 
 from collections.abc import Iterator, Sequence
+from itertools import combinations
 
 import numpy as np
 import pymc as pm
@@ -9,6 +10,7 @@ from pytensor.graph.traversal import ancestors
 
 from ..errors import ModelError
 from .candidates import Candidates
+from .density import Array, Point, SubmodelDensity
 from .estimates import LEAST_EFFECTIVE, Visits, Weighted
 from .probabilities import Probabilities
 
@@ -19,6 +21,7 @@ MOST_APART, LEAST_APART = 4.0, 0.02  # of visits and probabilities: errors, and 
 # sub-models (`benchmarks.terms_poor_draws`).
 LEAST_OF_FULL = 5.0
 NEGLIGIBLE = 0.005  # probability of a single one
+N_COMPARED, SAME = 3, 1e-9  # draws at which terms are told apart; relative, of equal likelihoods
 
 
 def check_finite(points: Sequence[Weighted], candidates: Candidates) -> None:
@@ -35,6 +38,45 @@ def check_finite(points: Sequence[Weighted], candidates: Candidates) -> None:
                 "prior of a variable that depends on it, is zero or not finite at all points of "
                 "all sub-models without it"
             )
+
+
+def check_distinct(density: SubmodelDensity, draws: Array, rng: np.random.Generator) -> None:
+    """Raise if two candidates switch off the same term, as the factors of a product do.
+
+    Without either of them the likelihood is then the same, whatever the draws (n, k) are, and it is
+    another one with both.
+    """
+    n = len(density.candidates)
+    x = draws[rng.integers(len(draws), size=N_COMPARED)]
+    seeds = density.fresh_seeds(N_COMPARED, rng)
+    sets = np.concatenate([np.ones((1, n), dtype=bool), ~np.eye(n, dtype=bool)])
+    found = density.evaluate(
+        Point(
+            np.tile(x, (n + 1, 1)),
+            np.repeat(sets, N_COMPARED, axis=0),
+            np.tile(seeds, (n + 1, 1)),
+        )
+    )
+    likelihood = (found.total - found.own.sum(axis=1)).reshape(n + 1, N_COMPARED)
+    full, without = likelihood[0], likelihood[1:]
+    for a, b in combinations(range(n), 2):
+        if _is_same(without[a], without[b]) and not _is_same(without[a], full):
+            first, second = (density.candidates.keys[i] for i in (a, b))
+            raise ModelError(
+                f"absent must have one candidate for a term: {first!r} and {second!r} switch off "
+                "the same one, as neither has an effect without the other. Leave one of them out, "
+                f"or give the tuple {(*_names(first), *_names(second))}"
+            )
+
+
+def _is_same(a: Array, b: Array) -> bool:
+    """Whether log-likelihoods are equal but for rounding."""
+    with np.errstate(invalid="ignore"):  # of infinities, which tell nothing
+        return bool((np.abs(a - b) <= SAME * (1 + np.abs(a))).all())
+
+
+def _names(key: str | tuple[str, ...]) -> tuple[str, ...]:
+    return (key,) if isinstance(key, str) else key
 
 
 def unreliable(found: Probabilities, points: Sequence[Weighted]) -> NDArray[np.bool_]:
@@ -82,7 +124,8 @@ def doubts(
         "parameters: name fewer candidates, or compare the result with that of another random_seed"
         if full is None
         else "give more draws of the full model as idata, or a filter with more particles where "
-        "the likelihood is noisy"
+        "the likelihood is noisy; and what only one term uses, as a gap, together with it, as "
+        "('k', 'gap') in absent"
     )
     poor = unreliable(found, points)
     share = float(found.of_models[poor].sum())

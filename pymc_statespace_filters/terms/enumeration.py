@@ -16,8 +16,7 @@ from .estimates import Sampler, Weighted
 from .inclusion import InclusionPrior
 from .probabilities import Probabilities
 from .proposals import Guide
-from .screening import N_SCREENED, Announce, improved, proposals_of, screened
-from .unused import Uses
+from .screening import N_SCREENED, Announce, improved, screened
 
 FEWEST = 100  # points of a sub-model within reach
 LARGE, ENOUGH = (
@@ -35,7 +34,6 @@ def estimate_all(
     candidates: Candidates,
     prior: InclusionPrior,
     guide: Guide,
-    uses: Uses,
     sampler: Sampler,
     rng: np.random.Generator,
     announce: Announce,
@@ -43,7 +41,7 @@ def estimate_all(
     """Points of all sub-models (S, K), enough for the probabilities of inclusion."""
     log_prior = prior.log_weight(sets)
     announce("all sub-models", N_SCREENED * len(sets))
-    proposals = proposals_of(sets, guide, uses, sampler)
+    proposals = [guide.proposal(one) for one in sets]
     found, chosen = screened(proposals, log_prior, sampler, rng)
     check_finite(found, candidates)
     found = [one if chosen[i] else one.without_points() for i, one in enumerate(found)]

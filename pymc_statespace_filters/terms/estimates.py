@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from ..evidence.estimators.newton import BatchFunction
@@ -27,7 +26,6 @@ from ..importance import (
 )
 from .density import Array, Point, Seeds, Sets, SubmodelDensity
 from .proposals import Proposal
-from .unused import same
 
 LEAST_EFFECTIVE = MIN_EFFECTIVE / 2  # points of a sub-model whose error can be believed
 LEAST_FOR_TAIL = 25  # weights to which a Pareto tail is fitted
@@ -156,14 +154,10 @@ class Sampler:
     density : SubmodelDensity
     base : ndarray (k,)
         Values for columns that a sub-model does not have.
-    pool : ndarray (m, k)
-        Draws of the prior.
     """
 
-    def __init__(
-        self, density: SubmodelDensity, base: Array, pool: Array, rng: np.random.Generator
-    ) -> None:
-        self._density, self._base, self._pool, self._rng = density, base, pool, rng
+    def __init__(self, density: SubmodelDensity, base: Array, rng: np.random.Generator) -> None:
+        self._density, self._base, self._rng = density, base, rng
         self.n_evaluations = 0
 
     @property
@@ -171,43 +165,24 @@ class Sampler:
         """Whether likelihoods are estimates."""
         return bool(self._density.density.seed_names)
 
-    def is_free(self, proposals: Sequence[Proposal]) -> NDArray[np.bool_]:
-        """Whether densities are the same for all values of what is taken for unused."""
-        points = [one.sample(1, self._base, self._pool, self._rng)[0] for one in proposals]
-        before = np.concatenate(points)
-        after = before.copy()
-        for row, one in zip(after, proposals, strict=True):
-            row[one.unused] = self._pool[self._rng.integers(len(self._pool)), one.unused]
-        present = np.array([one.present for one in proposals])
-        seeds = self._density.fresh_seeds(len(before), self._rng)
-        left_out = np.array([one.unused_blocks for one in proposals])
-        a, b = (self._left(Point(x, present, seeds), left_out) for x in (before, after))
-        return same(a, b)
-
-    def _left(self, at: Point, left_out: NDArray[np.bool_]) -> Array:
-        """Log-densities (n,) without the priors of blocks (n, blocks) that integrate to one."""
-        found = self._density.evaluate(at)
+    def _log_density(self, at: Point) -> Array:
+        found = self._density.evaluate(at).total
         self.n_evaluations += len(at.x)
-        return np.asarray(found.total - np.where(left_out, found.own, 0.0).sum(axis=1))
+        return found
 
     def log_density_of(self, proposal: Proposal) -> BatchFunction:
         """The log-density (n,) of a sub-model at coordinates (n, d) that its proposal draws.
 
-        Of a likelihood without noise; unused variables have some values of the prior.
+        Of a likelihood without noise.
         """
-        base = self._base.copy()
-        base[proposal.unused] = self._pool[0, proposal.unused]
 
         def evaluate(drawn: Array) -> Array:
-            y = np.tile(base, (len(drawn), 1))
+            y = np.tile(self._base, (len(drawn), 1))
             y[:, proposal.drawn] = drawn
             x, log_volume = proposal.coordinates.backward(y, proposal.drawn)
             present = np.broadcast_to(proposal.present, (len(x), len(proposal.present)))
-            left_out = np.broadcast_to(
-                proposal.unused_blocks, (len(x), len(proposal.unused_blocks))
-            )
             seeds = np.zeros((len(x), 0), dtype=np.int64)
-            return self._left(Point(x, present, seeds), left_out) - log_volume
+            return self._log_density(Point(x, present, seeds)) - log_volume
 
         return evaluate
 
@@ -216,16 +191,14 @@ class Sampler:
         if not proposals:
             return []
         drawn = [
-            one.sample(count, self._base, self._pool, self._rng)
+            one.sample(count, self._base, self._rng)
             for one, count in zip(proposals, counts, strict=True)
         ]
         x = np.concatenate([points for points, _ in drawn])
         present = np.repeat([one.present for one in proposals], counts, axis=0)
         seeds = self._density.fresh_seeds(len(x), self._rng)
-        left_out = np.repeat([one.unused_blocks for one in proposals], counts, axis=0)
-        log_left = self._left(Point(x, present, seeds), left_out)
         log_q = np.concatenate([log_q for _, log_q in drawn])
-        log_weights = log_left - log_q
+        log_weights = self._log_density(Point(x, present, seeds)) - log_q
         ends = np.cumsum(counts)[:-1]
         parts = (np.split(each, ends) for each in (x, seeds, log_weights))
         return [

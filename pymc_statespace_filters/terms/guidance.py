@@ -12,8 +12,7 @@ from ..evidence.estimators.student_mixture import flattened
 from .density import SubmodelDensity
 from .estimates import Sampler, Weighted
 from .proposals import Guide
-from .screening import N_PILOT, Announce, improved, is_worthless, proposals_of
-from .unused import Uses
+from .screening import N_PILOT, Announce, improved, is_worthless
 
 # Effective points per point of the full model, below which the draws are replaced. Draws of the
 # posterior have 0.1 to 0.6; those that are off by six standard deviations 0.005
@@ -26,13 +25,12 @@ N_ROUNDS, N_POINTS = 8, 2000  # of replacing them, and points of the full model 
 def checked_guide(
     guide: Guide,
     density: SubmodelDensity,
-    uses: Uses,
     sampler: Sampler,
     rng: np.random.Generator,
     announce: Announce,
 ) -> tuple[Guide, Weighted]:
     """The guide, or a better one, and points of the full model that judge it."""
-    best = at = guide, _full_model(guide, uses, sampler)
+    best = at = guide, _full_model(guide, sampler)
     for _ in range(N_ROUNDS):
         if best[1].efficiency >= POOR:
             break
@@ -42,7 +40,7 @@ def checked_guide(
         if not np.isfinite(points.log_weights).any():
             break
         again = Guide.of_points(density, flattened(points.x, points.log_weights, rng), rng)
-        at = again, _full_model(again, uses, sampler)
+        at = again, _full_model(again, sampler)
         if at[1].efficiency > best[1].efficiency:
             best = at
         elif sampler.is_noisy and not is_worthless(best[1]):
@@ -50,7 +48,7 @@ def checked_guide(
     return best
 
 
-def _full_model(guide: Guide, uses: Uses, sampler: Sampler) -> Weighted:
-    every = np.ones((1, len(guide.distances)), dtype=bool)
-    [points] = sampler.draw(proposals_of(every, guide, uses, sampler), [N_PILOT])
+def _full_model(guide: Guide, sampler: Sampler) -> Weighted:
+    every = np.ones(len(guide.distances), dtype=bool)
+    [points] = sampler.draw([guide.proposal(every)], [N_PILOT])
     return points

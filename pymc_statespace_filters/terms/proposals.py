@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pymc as pm
 import xarray as xr
-from numpy.typing import NDArray
 
 from ..errors import ModelError
 from ..evidence.estimators.student_mixture import flattened_copy
@@ -40,9 +39,8 @@ class Proposal:
     ----------
     present : ndarray of bool (K,)
         The terms of the sub-model.
-    drawn, unused : ndarray of int
-        Columns drawn from the mixture, and from the prior.
-    unused_blocks : ndarray of bool (blocks,)
+    drawn : ndarray of int
+        The columns that it has.
     mixture, first : StudentMixture
         Of the coordinates of the columns ``drawn``; what it was before it was fitted again.
     coordinates : Coordinates
@@ -50,24 +48,18 @@ class Proposal:
 
     present: Sets
     drawn: Columns
-    unused: Columns
-    unused_blocks: NDArray[np.bool_]
     mixture: StudentMixture
     first: StudentMixture
     coordinates: Coordinates
 
-    def sample(
-        self, count: int, base: Array, pool: Array, rng: np.random.Generator
-    ) -> tuple[Array, Array]:
-        """Points (count, k) and their log-density without that of unused variables, (count,).
+    def sample(self, count: int, base: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Points (count, k) and their log-density (count,).
 
-        ``base`` (k,) has values for the columns of absent terms, and ``pool`` (m, k) draws of the
-        prior.
+        ``base`` (k,) has values for the columns of absent terms.
         """
         y = np.tile(base, (count, 1))
         drawn = self.mixture.sample(count, rng)
         y[:, self.drawn] = drawn
-        y[:, self.unused] = pool[rng.integers(len(pool), size=count)][:, self.unused]
         x, log_volume = self.coordinates.backward(y, self.drawn)
         return x, self.mixture.log_density(drawn) + log_volume
 
@@ -162,17 +154,14 @@ class Guide:
         columns = self._density.candidates.switches.columns
         return np.array([of_columns[one].max() for one in columns])
 
-    def proposal(self, present: Sets, unused_blocks: NDArray[np.bool_]) -> Proposal:
+    def proposal(self, present: Sets) -> Proposal:
         """The mixture given that the terms of a sub-model that are absent vanish."""
-        has = self._density.columns_of(present)
-        is_unused = unused_blocks[self._density.blocks[has]]
-        drawn, unused = has[~is_unused], has[is_unused]
-        absent = np.setdiff1d(np.arange(self.draws.shape[1]), has)
+        drawn = self._density.columns_of(present)
+        absent = np.setdiff1d(np.arange(self.draws.shape[1]), drawn)
         mixture = self._mixture.conditioned(drawn, self._given[absent], self._values[absent])
         mixture = mixture.tilted(-self._slopes[~present].sum(axis=0)[drawn])
         wider = mixture.with_wide_parts(WIDE)
-        blocks = np.isin(np.arange(len(unused_blocks)), self._density.blocks[unused])
-        return Proposal(present, drawn, unused, blocks, wider, wider, self.coordinates)
+        return Proposal(present, drawn, wider, wider, self.coordinates)
 
     def _slopes_of_priors(self, y: Array) -> Array:
         """How the log prior densities of absent terms change with other coordinates, (K, k).

@@ -10,10 +10,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from .density import Array, Sets
+from .density import Array
 from .estimates import Sampler, Weighted
-from .proposals import Guide, Proposal
-from .unused import Uses
+from .proposals import Proposal
 
 N_SCREENED = 25  # points of every sub-model
 MOST_SCREENED = 20_000  # points of all sub-models that are drawn again, unless 25 each are more
@@ -23,18 +22,6 @@ N_PILOT, GOOD = 200, 0.25  # points that judge a proposal; effective points per 
 N_REFITS = 5
 
 Announce = Callable[[str, int], None]
-
-
-def proposals_of(sets: Sets, guide: Guide, uses: Uses, sampler: Sampler) -> list[Proposal]:
-    """The proposals of sub-models, with unused variables where there are some."""
-    unused = [uses.unused(one) for one in sets]
-    found = [guide.proposal(one, blocks) for one, blocks in zip(sets, unused, strict=True)]
-    doubtful = [i for i, one in enumerate(found) if one.unused.size]
-    if doubtful:
-        is_free = sampler.is_free([found[i] for i in doubtful])
-        for i in np.compress(~is_free, doubtful):
-            found[i] = guide.proposal(sets[i], np.zeros_like(unused[i]))
-    return found
 
 
 def screened(

@@ -21,7 +21,7 @@ from ..system.checks import check_random_seed
 from .candidates import read_candidates
 from .chain import MOST_MENDED, run_chains
 from .density import SubmodelDensity
-from .doubts import check_finite, doubts, doubts_of_potentials
+from .doubts import check_distinct, check_finite, doubts, doubts_of_potentials
 from .draws import averaged
 from .enumeration import estimate_all, probabilities, until_certain, with_lighter_tails
 from .estimates import Sampler
@@ -30,7 +30,6 @@ from .inclusion import BETA_BINOMIAL, MOST_COUNTED, read_inclusion
 from .maxima import Maxima
 from .proposals import Guide
 from .result import as_datatree
-from .unused import find_uses, prior_pool
 
 
 @shared_by_ranks
@@ -59,7 +58,8 @@ def select_terms(
         The candidates, and the values at which their terms vanish: a scalar variable ``"k3"``; an
         element by its position or by the coordinates that the model gives it, ``"b[3]"`` or
         ``"b[z^3]"``; ``"b"`` for each element of a vector; or a tuple of such names, with a tuple
-        of values, for what comes and goes together.
+        of values, for what comes and goes together: a spring and its gap, ``("k", "gap")`` with
+        ``(0.0, 0.3)``. The gap has no use without the spring, so that any value of it will do.
     idata : xarray.DataTree, optional
         Posterior draws of the full model, from any sampler. They say where to look, and not what
         the result is. Default: those of `sample`. Where its chains mix slowly, `sample_smc` with
@@ -145,8 +145,9 @@ def select_terms(
     mixture of a sub-model comes from its own maxima, found by Newton's method from those of the
     sub-model that the chain comes from.
 
-    Variables that only absent terms use have their prior: the scale of the slabs, the gap of a
-    spring that is not there.
+    A variable that only absent terms use has its prior in a sub-model, such as a scale of slabs.
+    Where that is far from what the full model says of it, the points of the sub-model are worth
+    little, which a warning says: a tuple in `absent` makes it a part of the term.
 
     References
     ----------
@@ -191,17 +192,17 @@ def select_terms(
         density = SubmodelDensity(model, candidates)
         guide = Guide.of_draws(density, idata, rng)
         with row_progress(density.density.calls, enabled=progressbar) as announce:
-            uses = find_uses(density, guide.draws, rng)
-            sampler = Sampler(density, guide.base, prior_pool(density, uses, rng), rng)
-            guide, full = checked_guide(guide, density, uses, sampler, rng, announce)
+            check_distinct(density, guide.draws, rng)
+            sampler = Sampler(density, guide.base, rng)
+            guide, full = checked_guide(guide, density, sampler, rng, announce)
             visits = maxima = None
             if prior.n_open <= MOST_COUNTED:
                 sets = prior.all_sets()
-                points = estimate_all(sets, candidates, prior, guide, uses, sampler, rng, announce)
+                points = estimate_all(sets, candidates, prior, guide, sampler, rng, announce)
             else:
                 if full.efficiency < NO_GUIDE and not sampler.is_noisy:
                     maxima = Maxima(density, guide, sampler, rng)
-                visits = run_chains(prior, guide, uses, sampler, rng, announce, maxima)
+                visits = run_chains(prior, guide, sampler, rng, announce, maxima)
                 check_finite(visits.points, candidates)
                 sets, points = visits.sets, visits.points
                 if maxima is not None:

@@ -120,11 +120,8 @@ def _curves(
         "se": error,
     }
     candidates = density.candidates
-    left_out = [
-        label
-        for label, columns in zip(candidates.labels, candidates.switches.columns, strict=True)
-        if (scale[columns] == "").any()
-    ]
+    columns = np.concatenate(candidates.switches.columns)
+    left_out = [candidates.elements.labels[i] for i in columns if scale[i] == ""]
     return dataset_of_curves(
         fields,
         candidates.labels,

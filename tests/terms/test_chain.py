@@ -38,7 +38,7 @@ def test_visits_are_as_frequent_as_probable(sd, monkeypatch):
     monkeypatch.setattr(chain, "N_STEPS", 8000)
     prior = InclusionPrior(None, np.zeros((2, 2), dtype=bool))
     guide = SimpleNamespace(distances=np.array([1.5, 2.5]))
-    visits = chain.run_chains(prior, guide, None, None, rng, lambda task, total: None)
+    visits = chain.run_chains(prior, guide, None, rng, lambda task, total: None)
     assert (visits.error < 0.01).all()
     np.testing.assert_array_less(abs(visits.frequency - INCLUSION), 4 * visits.error)
     assert not visits.alone.any()
@@ -92,7 +92,7 @@ def test_what_was_not_met_is_part_of_the_error(monkeypatch):
         met = Independent(log_odds)
         monkeypatch.setattr(chain, "_Met", lambda *args, met=met: met)
         rng = np.random.default_rng(seed)
-        visits = chain.run_chains(prior, guide, None, None, rng, lambda task, total: None)
+        visits = chain.run_chains(prior, guide, None, rng, lambda task, total: None)
         found = Probabilities(
             visits.sets, visits.sets @ log_odds, *np.zeros((2, len(visits.sets)))
         ).inclusion

@@ -15,8 +15,6 @@ from pymc_statespace_filters.terms.doubts import doubts
 from pymc_statespace_filters.terms.estimates import Sampler
 from pymc_statespace_filters.terms.maxima import Maxima, proposal_by
 from pymc_statespace_filters.terms.proposals import Guide
-from pymc_statespace_filters.terms.screening import proposals_of
-from pymc_statespace_filters.terms.unused import find_uses, prior_pool
 from tests.terms.regression import Regression
 
 SELECT = sys.modules["pymc_statespace_filters.terms.select_terms"]
@@ -30,17 +28,11 @@ class Search:
         self.density = SubmodelDensity(model, read_candidates(model, absent))
         draws = scale * rng.standard_normal((500, len(self.density.blocks)))
         self.guide = Guide(self.density, draws, draws, rng)
-        self.uses = find_uses(self.density, draws, rng)
-        pool = prior_pool(self.density, self.uses, rng)
-        self.sampler = Sampler(self.density, self.guide.base, pool, rng)
+        self.sampler = Sampler(self.density, self.guide.base, rng)
         self.maxima = Maxima(self.density, self.guide, self.sampler, rng)
 
-    def first(self, present):
-        [one] = proposals_of(present[None], self.guide, self.uses, self.sampler)
-        return one
-
     def of(self, present, known):
-        return self.maxima.of(self.first(present), known)
+        return self.maxima.of(self.guide.proposal(present), known)
 
 
 def test_maxima_have_the_evidence_of_normal_posteriors():
@@ -61,7 +53,7 @@ def test_maxima_have_the_evidence_of_normal_posteriors():
         ]
         assert len(known) == 1
         np.testing.assert_allclose(known[0].log_evidence, exact, atol=1e-3)
-        [points] = search.sampler.draw([proposal_by(known, search.first(present))], [1000])
+        [points] = search.sampler.draw([proposal_by(known, search.guide.proposal(present))], [1000])
         assert points.efficiency > 0.4
         np.testing.assert_allclose(points.mean.value, exact, atol=4 * points.mean.error)
 
