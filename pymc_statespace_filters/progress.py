@@ -1,172 +1,14 @@
-"""Progress bars of chains and of rows, drawn by PyMC, and a line while machine code is compiled."""
+"""Progress of rows and stages, and a line while machine code is compiled."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from threading import Timer
 from time import perf_counter
 from typing import Any, Protocol
 
-from pymc.progress_bar import ProgressBarManager, create_simple_progress
-from pymc.progress_bar.rich_progress import RichProgressBackend
-from rich.console import Console, RenderableType
-from rich.progress import ProgressColumn, TextColumn
-from rich.table import Column
-from rich.theme import Theme
-
-# Below this fraction of accepted proposals a bar turns red, and the end of a chain has a warning.
-MIN_ACCEPT_RATE = 0.01
+from rich.console import Console
 
 PATIENCE = 2.0  # seconds without a progress bar
-
-
-def step_columns(n_chains: int) -> tuple[list[ProgressColumn], dict[str, list]]:
-    """DRAM's column in the bar of ``pm.sample``, and its first values, one per chain.
-
-    With a second one, PyMC would cut the times off in a terminal of 80 columns.
-    """
-    return [_column("accept_rate", "Accept", "0.2f")], {"accept_rate": [0.0] * n_chains}
-
-
-def stat_values(stats: Mapping[str, Any]) -> dict[str, Any]:
-    """What columns show of a draw's statistics, and whether the bar turns red."""
-    return {
-        "accept_rate": stats["accept_rate"],
-        "failed": stats["n_failed"],
-        "failing": stats["accept_rate"] < MIN_ACCEPT_RATE,
-    }
-
-
-def _column(key: str, title: str, form: str) -> ProgressColumn:
-    return TextColumn(f"{{task.fields[{key}]:{form}}}", table_column=Column(title, no_wrap=True))
-
-
-class ChainProgress(ProgressBarManager):
-    """Progress bars of several chains, each advanced by many iterations at once.
-
-    A context manager that leaves the terminal as it was, however the block ends. To be used from
-    one thread.
-
-    Parameters
-    ----------
-    n_chains, draws, tune : int
-    progressbar : bool or str
-        As in ``pm.sample``: True, False, "combined", "split", "combined+stats", "split+stats".
-    theme : rich.theme.Theme or str, optional
-        Colours, or a style sheet for marimo.
-
-    Raises
-    ------
-    ValueError
-        If ``progressbar`` is something else; with the message of ``pm.sample``.
-
-    Examples
-    --------
-    >>> from pymc_statespace_filters.progress import ChainProgress
-    >>> with ChainProgress(n_chains=1, draws=1000, tune=500, progressbar=False) as bars:
-    ...     bars.update(0, 1500, {"accept_rate": 0.3, "n_failed": 0})
-    """
-
-    step_name = "Draw"
-
-    def __init__(
-        self,
-        n_chains: int,
-        draws: int,
-        tune: int,
-        progressbar: Any = True,
-        theme: Theme | str | None = None,
-    ):
-        super().__init__(n_chains, progressbar, theme)
-        chains_per_bar = n_chains if self.combined_progress else 1
-        self._tune = chains_per_bar * tune
-        self._totals = [draws + tune] * n_chains
-        self._done = [0] * n_chains
-        self._convergence: dict[int, tuple[float, float]] = {}
-        columns, stats = step_columns(n_chains)
-        columns.append(_column("failed", "Fails", "d"))
-        stats |= {"failed": [0] * n_chains, "draw": [0] * n_chains}
-        stats["marker_pos"] = [self._tune] * n_chains
-        self._backend = self._create_backend(self._total_of(0), columns, stats)
-        if isinstance(self._backend, RichProgressBackend):
-            # PyMC gives each column a fraction of the terminal's width, and cuts its text to it:
-            # let the bar alone take what the texts leave.
-            for column in self._backend._progress.columns[1:]:
-                column.get_table_column().ratio = None
-            self._add_last_line(self._backend._progress)
-
-    @property
-    def shows_convergence(self) -> bool:
-        """Whether `show_convergence` has an effect."""
-        return self._show_progress and self.full_stats
-
-    def update(self, chain: int, done: int, stats: Mapping[str, Any], seconds: float = 0.0) -> None:
-        """Show how many iterations a chain has made; its clock starts with the first of them.
-
-        Parameters
-        ----------
-        chain : int
-        done : int
-            Its iterations so far, warm-up included. Nothing is drawn if there are no new ones.
-        stats : mapping of str to number
-            "accept_rate" and "n_failed" of its last draw, as in ``sample_stats``.
-        seconds : float, optional
-            How long the chain has run, once it has ended: PyMC's bar has no speed for what took
-            less than a quarter of a second.
-        """
-        done = min(done, self._totals[chain])  # of a checkpoint there may be more
-        advance = done - self._done[chain]
-        if not self._show_progress or advance <= 0:
-            return
-        self._done[chain] = done
-        count = sum(self._done) if self.combined_progress else done
-        shown = stat_values(stats) | {"draw": count if count <= self._tune else count - self._tune}
-        self._advance(chain, advance, shown)
-        if count == self._total_of(chain):
-            if seconds > 0.0 and not self.combined_progress:
-                shown |= {"sampling_speed": done / seconds, "speed_unit": "draws/s"}
-            self._advance(chain, 0, shown, is_last=True)
-
-    def extend(self, chain: int, total: int) -> None:
-        """Raise the number of iterations of a chain that goes on after its end."""
-        self._totals[chain] = max(total, self._totals[chain])
-        self._advance(chain, 0, {"failing": False})
-
-    def show_convergence(self, model: int, rhat: float, ess: float) -> None:
-        """Show a model's largest R-hat and smallest effective sample size: the worst of all models.
-
-        They belong to no single chain, so they are in a line below the bars.
-        """
-        if self.shows_convergence:
-            self._convergence[model] = rhat, ess
-
-    def _add_last_line(self, progress: Any) -> None:
-        """Have rich draw a line below its table."""
-        tables = progress.get_renderables
-
-        def renderables() -> Iterator[RenderableType]:
-            yield from tables()
-            if self._convergence:
-                rhats, sizes = zip(*self._convergence.values(), strict=True)
-                text = f"largest R-hat {max(rhats):.2f}, smallest effective sample size "
-                yield f"  {text}{min(sizes):.0f}"
-
-        progress.get_renderables = renderables
-
-    def _total_of(self, chain: int) -> int:
-        """Iterations that the bar of a chain counts."""
-        return sum(self._totals) if self.combined_progress else self._totals[chain]
-
-    def _advance(
-        self, chain: int, advance: int, shown: dict[str, Any], is_last: bool = False
-    ) -> None:
-        self._backend.update(
-            task_id=0 if self.combined_progress else chain,
-            advance=advance,
-            failing=shown.pop("failing", False),
-            stats=shown,
-            is_last=is_last,
-            total=self._total_of(chain),
-        )
 
 
 class _RowProgress:
@@ -197,8 +39,7 @@ class _RowProgress:
             self._show()
 
     def _show(self) -> None:
-        bar = self._stack.enter_context(create_simple_progress())
-        self._stack.enter_context(_quiet_compilation())
+        bar = self._stack.enter_context(_bar())
         self._shown = bar, bar.add_task(self._task, completed=self._done, total=self._total)
 
 
@@ -236,13 +77,21 @@ def stage_progress(total: float, *, enabled: bool) -> Iterator[Callable[[float, 
             if not enabled or perf_counter() - start < PATIENCE:
                 return
             if shown is None:
-                bar = stack.enter_context(create_simple_progress())
-                stack.enter_context(_quiet_compilation())
+                bar = stack.enter_context(_bar())
                 shown = bar, bar.add_task(text, total=total)
             bar, row = shown
             bar.update(row, description=text, completed=done)
 
         yield show
+
+
+@contextmanager
+def _bar() -> Iterator[Any]:
+    """PyMC's bar, which is shown after seconds: who calls filters alone need not import PyMC."""
+    from pymc.progress_bar import create_simple_progress
+
+    with create_simple_progress() as bar, _quiet_compilation():
+        yield bar
 
 
 _shown: list[object] = []  # bars, and lines that may be

@@ -14,11 +14,11 @@ from .mobility import LOWER, STANDSTILL, chain_problems
 from .noise import variance_advice
 from .remedies import ways_to_mix
 from .report import closing_report
-from .words import log, sentences, tell
+from .words import log, sentences, told
 
 
-@tell.register
-def _(fact: EndedDram, begin: str = "") -> list[str]:
+@told.register
+def _(fact: EndedDram, begin: str) -> list[str]:
     of_chains = chain_problems(fact)
     said = [*of_chains.values(), *_noise(fact)]
     check = FilterCheck()

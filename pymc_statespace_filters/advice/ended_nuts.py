@@ -11,15 +11,15 @@ from .filter_check import check_filters
 from .missed import missed_of
 from .mixing import until_ess_problem
 from .remedies import alternatives, reaches_zero, without_transform
-from .words import log, tell
+from .words import log, told
 
 # Bayesian fraction of missing information of the energies, below which the tails of one are too
 # long for its momenta (Betancourt 2016).
 _LEAST_E_BFMI = 0.3
 
 
-@tell.register
-def _(fact: EndedNuts, begin: str = "") -> list[str]:
+@told.register
+def _(fact: EndedNuts, begin: str) -> list[str]:
     missed = missed_of(fact)
     n_iterations = fact.request.tune + fact.length.n_iterations
     check = check_filters(

@@ -9,7 +9,7 @@ from ..filter_checks.finding import EXACT, OFF
 from ..parallel.signals import unless_interrupted
 from ..pymc_model.inspection import observes_state_space
 from ..pymc_model.posterior_draws import MIN_DRAWS
-from .words import log, sentences, tell, warn_of_filters
+from .words import log, sentences, told, warn_of_filters
 
 # Runs of fewer iterations are trials.
 _LEAST_ITERATIONS = 600
@@ -32,8 +32,8 @@ def _(fact: FilterOutcomes) -> list[str]:
     return doubts(fact.outcomes)
 
 
-@tell.register
-def _(fact: UsedFilters, begin: str = "") -> list[str]:
+@told.register
+def _(fact: UsedFilters, begin: str) -> list[str]:
     found = check_filters(fact)
     found.tell(fact.level, begin)
     return list(found.warned)

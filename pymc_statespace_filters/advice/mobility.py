@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from ..filters.outcomes import COLLAPSED, Failure
 from ..lower_chains import LowerChain
-from ..progress import MIN_ACCEPT_RATE
+from ..sampling.output.chain_bars import MIN_ACCEPT_RATE
 from ..sampling.output.facts import EndedChain, EndedDram
 from ..sampling.output.phase_statistics import PhaseStatistics
 from ..sampling.target.record_target import RecordTarget

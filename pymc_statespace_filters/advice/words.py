@@ -16,9 +16,15 @@ def sentences(fact: Fact) -> list[str]:
     raise TypeError(f"there are no words for {type(fact).__name__}")
 
 
-@singledispatch
 def tell(fact: Fact, begin: str = "") -> list[str]:
     """Warn of a fact, in sentences with this beginning; those that were said."""
+    # Without a frame of functools, at which Python would place the warning.
+    return told.dispatch(type(fact))(fact, begin)
+
+
+@singledispatch
+def told(fact: Fact, begin: str) -> list[str]:
+    """How a fact is told; by default in its sentences, each with this beginning."""
     said = [begin + text for text in sentences(fact)]
     if fact.of_chains:
         log(said)

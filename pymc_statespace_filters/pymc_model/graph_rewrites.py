@@ -15,8 +15,8 @@ from pytensor.tensor.variable import TensorVariable
 
 from ..compiler.lowering.compiled_system import compile_system
 from ..errors import ModelError
-from ..filters.checks import check_system_and_filter, takes
 from ..filters import EKF, IPLF
+from ..filters.checks import check_system_and_filter, takes
 from ..filters.protocol import EnsembleFilter, Filter, ToleranceFilter
 from ..filters.signatures import PANEL
 from ..ops.distributed import CallbackLogLikelihood, CallbackLogLikelihoodOfNoise

@@ -17,9 +17,9 @@ from pymc.util import RandomGenerator, get_random_generator
 from pytensor.tensor.variable import TensorVariable
 
 from ..facts import sentences
-from ..progress import stat_values, step_columns
 from .kernel.state import ChainState, draw_key
 from .output import sample_stats
+from .output.chain_bars import stat_values, step_columns
 from .output.facts import EndedChain
 from .output.phase_statistics import PhaseStatistics
 from .run.chain import Chain

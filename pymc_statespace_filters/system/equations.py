@@ -8,9 +8,12 @@ from typing import Any
 import numpy as np
 import pytensor
 import pytensor.tensor as pt
-from pymc.pytensorf import constant_fold
 from pytensor.graph.basic import Constant, Variable
+from pytensor.graph.fg import FunctionGraph
+from pytensor.graph.rewriting.utils import rewrite_graph
 from pytensor.graph.traversal import graph_inputs
+from pytensor.tensor.rewriting.basic import topo_unconditional_constant_folding
+from pytensor.tensor.rewriting.shape import ShapeFeature
 from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
@@ -216,10 +219,16 @@ def static_shape(symbol: TensorVariable) -> tuple[int | None, ...]:
     """The static shape, which some operations (pt.roll) do not infer by themselves."""
     if None not in symbol.type.shape:
         return symbol.type.shape
-    lengths = constant_fold(
-        [symbol.shape[i] for i in range(symbol.type.ndim)], raise_not_constant=False
-    )
+    lengths = folded_constants([symbol.shape[i] for i in range(symbol.type.ndim)])
     return tuple(None if isinstance(s, Variable) else int(s) for s in lengths)
+
+
+def folded_constants(symbols: Sequence[Variable]) -> list[Any]:
+    """The values of those that are constant, and what the others have become."""
+    graph = FunctionGraph(outputs=list(symbols), features=[ShapeFeature()], copy_inputs=False)
+    rewrite_graph(graph)  # may show more of them to be constant
+    topo_unconditional_constant_folding.apply(graph)
+    return [each.data if isinstance(each, Constant) else each for each in graph.outputs]
 
 
 def read_covariance(role: str, value: Any, symbols: Sequence[str] = "") -> Any:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pymc as pm
 import pytensor.scalar as ps
 import pytensor.tensor as pt
 from pytensor.compile.sharedvalue import SharedVariable
@@ -226,17 +225,19 @@ def _log_density(variable: Any, value: TensorVariable) -> TensorVariable:
         )
     if variable.owner is None:
         raise ModelError(f"observation_dist must return distributions, got {variable}")
+    from pymc import logp  # the user has imported it
+
     missing = pt.isnan(value)
     # A number in place of NaN, which would survive in a gradient.
     value = pt.switch(missing, _ANY_VALUE, value)
     try:
         if "int" in variable.type.dtype:
             # A value that is not an integer has probability zero.
-            whole = pm.logp(variable, pt.cast(pt.round(value), variable.type.dtype))
+            whole = logp(variable, pt.cast(pt.round(value), variable.type.dtype))
             whole = _with_slope_at_zero(whole)
             there = pt.switch(pt.eq(value, pt.round(value)), whole, -float("inf"))
         else:
-            there = pm.logp(variable, value)
+            there = logp(variable, value)
     except NotImplementedError as error:
         raise ModelError(
             f"observation_dist must return distributions with a log-density, got {variable}: "

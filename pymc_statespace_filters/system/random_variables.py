@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytensor.tensor as pt
-from pymc.distributions.distribution import SymbolicRandomVariable
-from pymc.pytensorf import constant_fold
+from pytensor.compile.builders import OpFromGraph
 from pytensor.graph.basic import Apply, Constant, Variable
 from pytensor.graph.traversal import ancestors, io_toposort
 from pytensor.tensor.elemwise import Elemwise
@@ -20,8 +19,8 @@ from pytensor.tensor.subtensor import BaseSubtensor
 from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
-from .distributions import FINITE_LAWS, LAWS, Law, law_name, parameters_of
-from .equations import Equation, as_symbol, static_shape
+from . import distributions
+from .equations import Equation, as_symbol, folded_constants, static_shape
 from .graph_digest import is_made_after
 
 Values = Mapping[str, TensorVariable]
@@ -76,11 +75,11 @@ def trace_distributions(
     """
     role, entries = equation.role, _entries(equation, values)
     nodes = io_toposort([], entries)
-    variables = [node for node in nodes if _is_drawn(node)]
+    variables = [node for node in nodes if is_drawn(node)]
     _check_own(role, variables, theta)
     laws = [_law_of(role, node) for node in variables]
     sizes = [
-        law.count(_shape(node), parameters_of(node))
+        law.count(_shape(node), distributions.parameters_of(node))
         for law, node in zip(laws, variables, strict=True)
     ]
     for node in variables:
@@ -118,8 +117,8 @@ def _given_values(
     normal: Callable[[Apply, Sequence[TensorVariable]], TensorVariable],
 ) -> GivenValues | None:
     """The components given the values of the finite variables."""
-    variables = [node for node in nodes if _is_drawn(node)]
-    finite = [node for node in variables if type(node.op) in FINITE_LAWS]
+    variables = [node for node in nodes if is_drawn(node)]
+    finite = [node for node in variables if type(node.op) in distributions.FINITE_LAWS]
     if not finite:
         return None
     ends = np.cumsum([int(np.prod(_shape(node), dtype=int)) for node in finite]).tolist()
@@ -130,7 +129,7 @@ def _given_values(
     def value(node: Apply, parameters: Sequence[TensorVariable]) -> TensorVariable:
         if node not in starts:
             return normal(node, parameters)
-        shape, law = _shape(node), FINITE_LAWS[type(node.op)]
+        shape, law = _shape(node), distributions.FINITE_LAWS[type(node.op)]
         size = int(np.prod(shape, dtype=int))
         own = values[starts[node] : starts[node] + size].reshape(shape)
         numbers = (law.probability(own, *parameters), law.is_valid(*parameters))
@@ -173,19 +172,29 @@ def _check_own(role: str, variables: Sequence[Apply], theta: TensorVariable) -> 
             )
 
 
-def _is_drawn(node: Apply) -> bool:
-    return isinstance(node.op, RandomVariable | SymbolicRandomVariable)
+def is_drawn(node: Apply) -> bool:
+    """Whether a node draws a random variable."""
+    if not isinstance(node.op, OpFromGraph):  # as those of PyMC are, which takes long to import
+        return isinstance(node.op, RandomVariable)
+    from pymc.distributions.distribution import SymbolicRandomVariable
+
+    return isinstance(node.op, SymbolicRandomVariable)
 
 
-def _law_of(role: str, node: Apply) -> Law:
-    law = LAWS.get(type(node.op))
+def _law_of(role: str, node: Apply) -> "distributions.Law":
+    law = distributions.LAWS.get(type(node.op))
     if law is None:
+        known = ", ".join(sorted(map(distributions.law_name, distributions.LAWS)))
         raise ModelError(
-            f"{role} cannot draw {law_name(type(node.op))} as a function of standard normals; it "
-            f"knows {', '.join(sorted(map(law_name, LAWS)))}. Write others by these: a Poisson "
-            "inflated by zeros is pm.Bernoulli.dist(p) * pm.Poisson.dist(mu)"
+            f"{role} cannot draw {_name(node)} as a function of standard normals; it knows {known}."
+            " Write others by these: a Poisson inflated by zeros is pm.Bernoulli.dist(p) * "
+            "pm.Poisson.dist(mu)"
         )
     return law
+
+
+def _name(node: Apply) -> str:
+    return distributions.law_name(type(node.op))
 
 
 def _output(node: Apply) -> TensorVariable:
@@ -205,15 +214,15 @@ def _check_one_vector(role: str, node: Apply) -> None:
     shape = _shape(node)
     if node.op.ndim_supp == 1 and len(shape) != 1:
         raise ModelError(
-            f"{role} must draw one vector by each {law_name(type(node.op))}, got shape {shape}; "
+            f"{role} must draw one vector by each {_name(node)}, got shape {shape}; "
             "write one distribution for each vector"
         )
 
 
 def _check_constants(role: str, node: Apply) -> None:
     """Raise for a parameter that is a number outside its domain."""
-    parameters = parameters_of(node)
-    folded = constant_fold(parameters, raise_not_constant=False)
+    parameters = distributions.parameters_of(node)
+    folded = folded_constants(parameters)
     for (name, domain), value in zip(_law_of(role, node).domains.items(), folded, strict=True):
         if isinstance(value, Variable):
             if not isinstance(value, Constant):
@@ -221,7 +230,7 @@ def _check_constants(role: str, node: Apply) -> None:
             value = value.data
         if not np.all(domain.holds(np.asarray(value, dtype="float64"))):
             raise ModelError(
-                f"{role}: {name} of {law_name(type(node.op))} must be {domain.text}, got "
+                f"{role}: {name} of {_name(node)} must be {domain.text}, got "
                 f"{np.asarray(value).tolist()}"
             )
 
@@ -242,14 +251,14 @@ def _replaced(
         if isinstance(node.op, Elemwise) and node.outputs[0].type.dtype == "float32":
             # Of constants: PyMC's 1 / 3.0 would be a third to seven digits.
             inputs = [pt.cast(variable, "float64") for variable in inputs]
-        if _is_drawn(node):
+        if is_drawn(node):
             parameters = [pt.cast(value, "float64") for value in inputs[2:]]
             known[_output(node)] = pt.specify_shape(replacement(node, parameters), _shape(node))
         elif inputs != node.inputs:
             known.update(zip(node.outputs, _rebuilt(role, node, inputs), strict=True))
     symbols = [as_symbol(role, known.get(entry, entry)) for entry in entries]
     parts = [symbol.dimshuffle("x") if symbol.type.ndim == 0 else symbol for symbol in symbols]
-    return pt.concatenate(parts), [known[_output(node)] for node in nodes if _is_drawn(node)]
+    return pt.concatenate(parts), [known[_output(node)] for node in nodes if is_drawn(node)]
 
 
 def _rebuilt(role: str, node: Apply, inputs: Sequence[Variable]) -> list[Variable]:
@@ -280,4 +289,4 @@ def _are_separate(entries: Sequence[TensorVariable], variables: Sequence[Apply])
     for entry in entries:
         if entry not in drawn and drawn & set(ancestors([entry])):
             return False
-    return not any(drawn & set(ancestors(parameters_of(node))) for node in variables)
+    return not any(drawn & set(ancestors(distributions.parameters_of(node))) for node in variables)

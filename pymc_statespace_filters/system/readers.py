@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytensor
 import pytensor.tensor as pt
-from pymc.distributions.distribution import SymbolicRandomVariable
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import ancestors
-from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.random.type import RandomType
+
+from .random_variables import is_drawn
 
 if TYPE_CHECKING:
     from .model import StateSpaceModel
@@ -74,6 +74,6 @@ def _parts(system: "StateSpaceModel") -> tuple[list[Variable], list[Variable]]:
 def _parameters(draw: Variable) -> Variable:
     """The parameters of all distributions behind a draw, in one vector."""
     nodes = dict.fromkeys(v.owner for v in ancestors([draw]) if v.owner is not None)
-    drawn = [n for n in nodes if isinstance(n.op, RandomVariable | SymbolicRandomVariable)]
+    drawn = [node for node in nodes if is_drawn(node)]
     numbers = [v for node in drawn for v in node.inputs if hasattr(v.type, "dtype")]
     return pt.concatenate([pt.cast(v, "float64").ravel() for v in numbers])

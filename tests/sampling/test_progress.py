@@ -13,8 +13,8 @@ from rich.progress import Progress
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters import progress
-from pymc_statespace_filters.progress import ChainProgress
 from pymc_statespace_filters.sampling.nuts import chains
+from pymc_statespace_filters.sampling.output.chain_bars import ChainProgress
 from pymc_statespace_filters.sampling.step import DRAM
 
 TUNE, DRAWS = 100, 900
@@ -157,7 +157,7 @@ def test_bars_of_nuts_end_with_the_last_iteration(updates, monkeypatch, capfd):
 def test_a_row_that_was_an_estimate_is_whole_at_the_end(monkeypatch):
     work, shown = SimpleNamespace(on_progress=None), []
     monkeypatch.setattr(
-        progress, "create_simple_progress", lambda: shown.append(screen()) or shown[-1]
+        "pymc.progress_bar.create_simple_progress", lambda: shown.append(screen()) or shown[-1]
     )
     monkeypatch.setattr(progress, "PATIENCE", 0.0)
     with progress.row_progress(work, enabled=True) as begin:

@@ -14,7 +14,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import DataMismatchError
-from pymc_statespace_filters.progress import ChainProgress
+from pymc_statespace_filters.sampling.output.chain_bars import ChainProgress
 from pymc_statespace_filters.sampling.output.convergence import MAX_RHAT, convergence
 from pymc_statespace_filters.sampling.run import chain_task, model_task, scheduler
 from pymc_statespace_filters.sampling.run.thread_pool import ChainPool

@@ -6,8 +6,6 @@ import numpy as np
 import pytensor
 import pytensor.scalar as ps
 import pytensor.tensor as pt
-from pymc.distributions.moments import mean
-from pymc.exceptions import UndefinedMomentException
 from pytensor.graph.basic import Variable
 from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.tensor.elemwise import Elemwise
@@ -15,7 +13,7 @@ from pytensor.tensor.linalg import cholesky, solve_triangular
 from pytensor.tensor.variable import TensorVariable
 
 from ...errors import ModelError
-from ...system.distributions import SCALAR_LAWS, parameters_of
+from ...system import distributions
 from ...system.model import StateSpaceModel
 from ..codegen.array_fallback import array_code
 from ..codegen.function_types import CompiledFunction, jit
@@ -83,6 +81,9 @@ def expected_observation(
 
 
 def _mean(variable: TensorVariable) -> TensorVariable:
+    from pymc.distributions.moments import mean  # the user has imported PyMC
+    from pymc.exceptions import UndefinedMomentException
+
     try:
         return mean(variable)
     except (NotImplementedError, UndefinedMomentException) as error:
@@ -105,13 +106,13 @@ def conditional_moments(
 def unknown_moments(system: StateSpaceModel) -> list[str]:
     """Distributions of the observables whose moments are not in the table, by name."""
     variables = _distributions(system, {})
-    return [str(v.owner.op) for v in variables if type(v.owner.op) not in SCALAR_LAWS]
+    return [str(v.owner.op) for v in variables if type(v.owner.op) not in distributions.SCALAR_LAWS]
 
 
 def _moments_of(variable: TensorVariable) -> tuple[TensorVariable, TensorVariable]:
     op = variable.owner.op
-    parameters = [pt.cast(v, "float64") for v in parameters_of(variable.owner)]
-    expected, variance = SCALAR_LAWS[type(op)].moments(*parameters)
+    parameters = [pt.cast(v, "float64") for v in distributions.parameters_of(variable.owner)]
+    expected, variance = distributions.SCALAR_LAWS[type(op)].moments(*parameters)
     return pt.as_tensor(expected), pt.as_tensor(variance)
 
 

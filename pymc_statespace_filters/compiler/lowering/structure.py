@@ -7,12 +7,12 @@ import numpy as np
 import pytensor
 import pytensor.scalar as ps
 import pytensor.tensor as pt
-from pymc.pytensorf import constant_fold
 from pytensor.graph.basic import Constant, Variable
 from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
+from ...system.equations import folded_constants
 from ...system.model import StateSpaceModel
 from ..codegen.emitter import depends_on
 from ..codegen.expressions import Expression, in_order, is_constant
@@ -297,7 +297,7 @@ def _is_zero(matrix: TensorVariable, symbols: Mapping[str, TensorVariable]) -> b
 
 def zeros(vector: TensorVariable, symbols: Mapping[str, TensorVariable]) -> list[bool]:
     """Which elements are zero whatever the symbols; none where that cannot be decided."""
-    (folded,) = constant_fold([vector], raise_not_constant=False)
+    (folded,) = folded_constants([vector])
     if not isinstance(folded, Variable):
         return [not value for value in np.asarray(folded)]
     try:

@@ -13,7 +13,7 @@ from nutpie.compiled_pyfunc import from_pyfunc
 from xarray import DataTree
 
 from ...parallel.signals import interrupts_are_noted, takes_interrupt
-from ...progress import ChainProgress
+from ..output.chain_bars import ChainProgress
 from ..output.convergence import Convergence, convergence
 from ..run.request import SamplingRequest
 from ..run.stopping import Length, first_length, next_length

@@ -24,9 +24,9 @@ import numpy as np
 from ...errors import ParallelError
 from ...parallel.communicator import Communicator, describe_error
 from ...parallel.signals import ignored_interrupts, interrupts_are_noted, takes_interrupt
-from ...progress import ChainProgress
 from ..checkpoint.arrays import encoded
 from ..kernel.state import ChainState, Draws
+from ..output.chain_bars import ChainProgress
 from .chain_task import ChainTask
 from .messages import LISTENING_SECONDS, Kind, place_of
 from .model_task import ModelTask, key_of_chain

@@ -1,37 +1,8 @@
-"""The laws of noise: what replaces a random variable in a graph, by its kind."""
+"""The laws of noise: what replaces a random variable in a graph, by its kind.
 
-import pytensor.tensor.random.basic as ptr
-from pytensor.graph.basic import Apply
-from pytensor.tensor.variable import TensorVariable
+They load PyMC, and so are imported when the first distribution is met.
+"""
 
-from .finite import FINITE_LAWS, FiniteLaw
-from .scalar import SCALAR_LAWS, ScalarLaw
-from .vector import CategoricalLaw, MultinomialLaw, MvNormalLaw
+import lazy_loader
 
-__all__ = ["FINITE_LAWS", "LAWS", "SCALAR_LAWS", "FiniteLaw", "Law", "law_name", "parameters_of"]
-
-type Law = ScalarLaw | CategoricalLaw | MultinomialLaw | MvNormalLaw
-
-LAWS: dict[type, Law] = {
-    **SCALAR_LAWS,
-    ptr.CategoricalRV: CategoricalLaw(),
-    ptr.MultinomialRV: MultinomialLaw(),
-    ptr.MvNormalRV: MvNormalLaw(),
-}
-
-_PYMC_NAMES = {
-    "NegBinomial": "NegativeBinomial",
-    "InvGamma": "InverseGamma",
-    "WeibullBeta": "Weibull",
-}
-
-
-def law_name(kind: type) -> str:
-    """The name of a distribution in PyMC."""
-    name = kind.__name__.removesuffix("RV")
-    return _PYMC_NAMES.get(name, name)
-
-
-def parameters_of(node: Apply) -> list[TensorVariable]:
-    """The parameters of a random variable, which follow its generator and its size."""
-    return node.inputs[2:]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
