@@ -133,9 +133,10 @@ def test_text_is_utf8_on_every_system():
     assert (ROOT / psf.__name__ / "__init__.pyi").read_bytes().isascii()
 
 
-def test_importing_is_silent_and_leaves_mpi_and_jax_alone():
+def test_importing_a_sampler_is_silent_and_leaves_mpi_jax_and_statistics_alone():
     script = (
-        "import sys, pymc_statespace_filters; sys.exit(bool({'mpi4py', 'jax'} & set(sys.modules)))"
+        "import sys; from pymc_statespace_filters import sample_dram, sample_smc; "
+        "sys.exit(bool({'mpi4py', 'jax', 'arviz_stats'} & set(sys.modules)))"
     )
     command = [sys.executable, "-W", "error", "-c", script]
     done = subprocess.run(

@@ -1,7 +1,7 @@
 """The result `Evidence`, and the DataTree group ``evidence`` in which it is stored."""
 
 import math
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass, fields
 from html import escape
 from typing import Any
 
@@ -57,7 +57,7 @@ class Evidence:
     approximate : bool, optional
         Whether a filter's likelihood is neither exact nor unbiased for its system, as that of an
         EKF for a nonlinear one: the evidence is then that of the filter's approximation. None if
-        unknown, as in files of earlier versions.
+        unknown.
 
     Raises
     ------
@@ -170,18 +170,9 @@ def stored_evidences(idata: xr.DataTree, name: str) -> dict[str, Evidence]:
 
 
 def _record(group: xr.Dataset, row: int) -> dict[str, Any]:
-    """The fields of one estimate, except its estimator.
-
-    Those with a default may be missing, or NaN, in groups stored by earlier versions.
-    """
-    record = {}
-    for one in fields(Evidence):
-        if one.name == "estimator" or one.name not in group:
-            continue
-        value = group[one.name].values[row]
-        value = value.item() if hasattr(value, "item") else value
-        if one.default is MISSING or value == value:
-            record[one.name] = value
-    if "approximate" in record:
-        record["approximate"] = bool(record["approximate"])
+    """The fields of one estimate, except its estimator."""
+    names = [one.name for one in fields(Evidence) if one.name != "estimator"]
+    record = {name: np.asarray(group[name].values[row]).item() for name in names}
+    approximate = record["approximate"]
+    record["approximate"] = None if math.isnan(approximate) else bool(approximate)
     return record

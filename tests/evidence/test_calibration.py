@@ -18,8 +18,6 @@ from tests.evidence.calibration import (
 )
 from tests.evidence.targets import half_normally_distributed
 
-QUICK = "half-normal, log"
-
 
 def pairs(cases):
     """Estimators that report an error, with the targets that they are for."""
@@ -53,11 +51,6 @@ def test_the_verdict_finds_wrong_errors(wrong, is_right):
     assert result.is_right == is_right
     assert result.n_evaluations == 7
     assert result.actual == pytest.approx(0.05, rel=0.2)
-
-
-@pytest.mark.parametrize(("target", "name"), pairs({QUICK: CASES[QUICK]}))
-def test_errors_of_a_few_replications(target, name):
-    assert calibrate(CALIBRATED[name], CASES[target].source, 20).is_right
 
 
 @pytest.mark.slow

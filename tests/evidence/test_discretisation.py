@@ -138,16 +138,14 @@ def test_a_proper_prior_keeps_the_double_well_away_from_the_limit():
     assert doubts(model, idata) == []
 
 
-@pytest.mark.filterwarnings("ignore:the log-evidence from draws .* missed a part")
 def test_one_well_under_a_wide_prior_reaches_the_limit():
     """Thesis, Case 2: nothing but the Euler limit 2 alpha dt = 2 ends the posterior of alpha."""
     model, idata, record = double_well(
         lambda name: pm.Uniform(name, 0, 200), lambda name: pm.Uniform(name, -200, 200), 0
     )
     assert (record > 0.2).all()
-    found = doubts(model, idata)
-    assert any("the posterior ends where the integration steps become unstable" in d for d in found)
-    with pytest.warns(EvidenceWarning, match="the integration steps become unstable"):
+    message = "the posterior ends where the integration steps become unstable"
+    with pytest.warns(EvidenceWarning, match=message):
         psf.chib_jeliazkov(idata, model, n_proposals=500, random_seed=1)
 
 

@@ -1,7 +1,5 @@
 """Estimates from draws of `sample_smc`, of which only the populations are independent."""
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import arviz as az
@@ -21,7 +19,6 @@ from pymc_statespace_filters.evidence.shorter_steps import _changes
 from pymc_statespace_filters.importance import mcse, mcse_of_populations
 from pymc_statespace_filters.pymc_model.posterior_draws import BY_PARTICLES, populations_of
 from tests.evidence.targets import Regression
-from tests.waiting import LIMIT
 
 R, N, SCATTER = 8, 100, 0.4
 
@@ -133,16 +130,6 @@ class TestModel:
     def test_a_poor_fit_is_not_sent_to_an_estimator_that_refuses_them(self, model):
         with model, pytest.warns(EvidenceWarning, match="the evidence that sample_smc has stored"):
             estimation.estimate_evidence(self.idata(8), target_se=1e-4, random_seed=1)
-
-
-def test_importing_posteriors_leaves_the_statistics_of_arviz_alone():
-    """As `sample_smc` imports them."""
-    script = (
-        "import sys, pymc_statespace_filters.evidence.posterior; "
-        "sys.exit('arviz_stats' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", script], timeout=LIMIT, check=False)
-    assert done.returncode == 0
 
 
 def test_the_error_of_a_mean_is_that_of_unequal_clusters():

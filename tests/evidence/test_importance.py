@@ -128,12 +128,6 @@ def test_what_no_proposal_has_sampled_is_a_part_of_the_error():
     assert abs(found.log_evidence - target.log_evidence) < 4 * found.se
 
 
-def test_same_seed_same_number():
-    posterior = gaussian(2, (2, 500), np.random.default_rng(60))
-    one, other = (Importance().estimate(posterior, rng=np.random.default_rng(1)) for _ in range(2))
-    assert one.log_evidence == other.log_evidence
-
-
 def test_no_density_where_the_draws_are():
     rng = np.random.default_rng(61)
     posterior = replace(

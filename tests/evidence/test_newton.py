@@ -10,7 +10,7 @@ from pymc_statespace_filters.evidence.estimators.newton import (
     derivatives,
     newton_maximize,
 )
-from pymc_statespace_filters.evidence.estimators.whitening import moments_within_chains
+from pymc_statespace_filters.evidence.estimators.whitening import moments, moments_within_chains
 
 
 def test_coordinates_are_those_within_chains():
@@ -22,11 +22,12 @@ def test_coordinates_are_those_within_chains():
     np.testing.assert_allclose(chol @ chol.T, expected, rtol=1e-12)
 
 
-def test_draws_that_do_not_vary_have_no_coordinates():
+@pytest.mark.parametrize("coordinates", [moments, moments_within_chains])
+def test_draws_that_do_not_vary_have_no_coordinates(coordinates):
     draws = np.random.default_rng(39).standard_normal((2, 500, 2))
     draws[..., 1] = 0.0
     with pytest.raises(ModelError, match="vary in every direction"):
-        moments_within_chains(draws)
+        coordinates(draws)
 
 
 def test_a_search_starts_in_the_best_chains():

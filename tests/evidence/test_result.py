@@ -27,18 +27,6 @@ def test_what_is_stored_is_read(evidence):
     assert stored_evidences(idata, "a") == {evidence.estimator: evidence}
 
 
-def test_a_group_of_an_earlier_version_is_read():
-    idata = empty()
-    store_evidence(idata, TOLD, {})
-    recent = ["log_volume", "uniform", "improper", "approximate"]
-    idata["evidence"] = xr.DataTree(idata["evidence"].to_dataset().drop_vars(recent))
-    assert stored_evidences(idata, "a") == {EVIDENCE.estimator: EVIDENCE}
-    # Beside an estimate of this version, which has them.
-    newer = replace(TOLD, estimator="chib_jeliazkov")
-    store_evidence(idata, newer, {})
-    assert stored_evidences(idata, "a") == {"bridge": EVIDENCE, "chib_jeliazkov": newer}
-
-
 @pytest.mark.parametrize("approximate", [None, False, True])
 def test_a_file_holds_all_fields(tmp_path, approximate):
     idata, evidence = empty(), replace(TOLD, approximate=approximate)
@@ -79,12 +67,11 @@ OVER_THE_LINE = -np.log(2 * np.pi) - 0.5 * np.log(3) - 0.5 * 3 * Y.var()
 
 
 def test_uniform_priors_are_no_doubt_and_the_volume_gives_the_integral_of_the_likelihood():
-    for width in (20, 40):
-        idata, model = line(lambda w=width: pm.Uniform("mu", -w, w))
-        found = chib_jeliazkov(idata, model, random_seed=1)
-        assert found.doubts == ""
-        assert found.log_volume == pytest.approx(np.log(2 * width))
-        assert abs(found.log_evidence + found.log_volume - OVER_THE_LINE) < 4 * found.se < 0.2
+    idata, model = line(lambda: pm.Uniform("mu", -20, 20))
+    found = chib_jeliazkov(idata, model, random_seed=1)
+    assert found.doubts == ""
+    assert found.log_volume == pytest.approx(np.log(40))
+    assert abs(found.log_evidence + found.log_volume - OVER_THE_LINE) < 4 * found.se < 0.2
 
 
 def test_an_improper_prior_is_a_doubt():

@@ -95,7 +95,7 @@ def compare_evidence(
             The largest log-likelihood found, as in `Evidence`.
         ``approximate``
             Whether the likelihood is a filter's approximation, neither exact nor unbiased; missing
-            where this is unknown, as in files of earlier versions.
+            where this is unknown.
         ``step_error``, ``step_error_se``
             With `step_errors`: the change of the log-evidence if the integration step is halved,
             and its standard error; NaN for models that are not named there.
