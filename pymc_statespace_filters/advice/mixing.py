@@ -62,10 +62,12 @@ def _remedy(fact: EndedRun, enough: float, ways: Sequence[str]) -> str:
         return would_do + alternatives(["give a larger max_draws", *ways])
     if 2 * length.n_iterations > (request.max_draws or 0):
         return would_do + alternatives([f"give a larger max_draws than {request.max_draws}", *ways])
-    more = alternatives(["make more with psf.sample(continue_from=idata)", *ways])
+    more = "make more with psf.sample(continue_from=idata)"
+    if not fact.goes_on:
+        more = "draw more with psf.sample(draws=..., until_ess=None), which has no limit of time"
     return (
         f"{would_do}the run ended as twice as many would take longer than its "
-        f"{request.seconds:.0f} s: {more}"
+        f"{request.seconds:.0f} s: {alternatives([more, *ways])}"
     )
 
 

@@ -2,39 +2,54 @@
 
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+import pymc as pm
 from numpy.typing import NDArray
 from pytensor.compile.sharedvalue import SharedVariable
-from pytensor.graph.basic import Constant, Variable
+from pytensor.graph.basic import Constant
 
 from ..errors import ModelWarning
 from .held_seed import INSIDE
+from .inspection import state_space_nodes
 
 # An end of the data is this many times the range of all others away from them, and, where no number
 # is negative, farther than their range of logarithms: growth and decay have large ratios.
 _FAR, _FAR_IN_LOGS = 20.0, 1.5
+# The same of numbers that often stand for a missing value.
+_FAR_OF_CODES = 1.5
+_CODES = (99.0, 999.0, 9999.0, 99999.0)
 # Different numbers among the others; fewer say little of their range.
 _LEAST_DIFFERENT = 5
 
 
-def warn_of_missing_codes(name: str, observed: Variable, observables: Sequence[str]) -> None:
+def warn_of_missing_codes(name: str, observed: Any, observables: Sequence[str]) -> None:
     """Warn of a number in the data (J, p) that lies far from all others."""
-    if isinstance(observed, SharedVariable):
-        values = observed.get_value()
-    elif isinstance(observed, Constant):
-        values = observed.data
-    else:
-        return
-    for observable, column in zip(observables, values.T, strict=True):
+    for observable, column in zip(observables, _columns(observed), strict=False):
         if (far := _far_number(column)) is not None:
             warnings.warn(
                 f"observed of {name!r} has {observable} = {far:g} in "
-                f"{_rows(np.flatnonzero(column == far))}, more than {_FAR:g} times the range of "
-                "all other numbers away from them. If it stands for a missing value, put NaN there",
+                f"{_rows(np.flatnonzero(column == far))}, more than {_factor(far):g} times the "
+                "range of all other numbers away from them. If it stands for a missing value, put "
+                "NaN there",
                 ModelWarning,
                 skip_file_prefixes=INSIDE,
             )
+
+
+def has_missing_codes(model: pm.Model) -> bool:
+    """Whether the data of a model have such a number."""
+    observed = (model.rvs_to_values[model[name]] for name in state_space_nodes(model))
+    columns = (column for data in observed for column in _columns(data))
+    return any(_far_number(column) is not None for column in columns)
+
+
+def _columns(observed: Any) -> Sequence[NDArray[np.float64]]:
+    """What each observable has seen, if it is known."""
+    if isinstance(observed, SharedVariable):
+        return list(observed.get_value().T)
+    return list(observed.data.T) if isinstance(observed, Constant) else []
 
 
 def _far_number(column: NDArray[np.float64]) -> float | None:
@@ -44,9 +59,15 @@ def _far_number(column: NDArray[np.float64]) -> float | None:
         return None
     logs = distinct if distinct[0] < 0 else np.log(distinct + (distinct[0] == 0))
     for order in (slice(None), slice(None, None, -1)):
-        if _is_far(distinct[order], _FAR) and _is_far(logs[order], _FAR_IN_LOGS):
+        factor = _factor(distinct[order][0])
+        if _is_far(distinct[order], factor) and _is_far(logs[order], _FAR_IN_LOGS):
             return float(distinct[order][0])
     return None
+
+
+def _factor(number: float) -> float:
+    """How many times the range of the others a number is away from them to be named."""
+    return _FAR_OF_CODES if abs(number) in _CODES else _FAR
 
 
 def _is_far(numbers: NDArray[np.float64], factor: float) -> bool:

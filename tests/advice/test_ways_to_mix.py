@@ -7,13 +7,14 @@ import numpy as np
 import pymc as pm
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.advice.mixing import mixing_problem
+from pymc_statespace_filters.advice.mixing import mixing_problem, until_ess_problem
 from pymc_statespace_filters.advice.remedies import (
     alternatives,
     reaches_zero,
     ways_to_mix,
 )
 from pymc_statespace_filters.sampling.output.convergence import Convergence
+from pymc_statespace_filters.sampling.output.facts import EndedDram, EndedNuts
 from pymc_statespace_filters.unvisited import ALL_MODES
 
 RNG = np.random.default_rng(0)
@@ -69,6 +70,23 @@ def test_the_advice():
     assert alternatives(ways_to_mix(model, names, positions, "other")) == (
         "tune longer, use psf.sample(sampler='nuts'), or reparametrise other"
     )
+
+
+def test_chains_that_cannot_go_on_are_not_told_to():
+    """`continue_from` refuses draws of NUTS, whose chains had reached the limit of time."""
+    found = Convergence(np.array([900.0]), np.array([900.0]), np.array([1.02]))
+    request = SimpleNamespace(
+        until_ess=4000.0, chains=4, draws=2000, doubles_thin=True, max_draws=10**6, seconds=300.0
+    )
+    length = SimpleNamespace(n_iterations=2000)
+    ended = {"request": request, "length": length, "convergence": found, "names": ["a"]}
+    for goes_on, way in ((True, "continue_from=idata"), (False, "until_ess=None), which has no")):
+        fact = SimpleNamespace(**ended, seconds=200.0, goes_on=goes_on)
+        text = until_ess_problem(fact, lambda name: [])
+        assert way in text
+        assert ("continue_from" in text) is goes_on
+    assert EndedDram.goes_on
+    assert not EndedNuts.goes_on
 
 
 def test_draws_of_separate_modes_are_to_be_drawn_from_the_prior():

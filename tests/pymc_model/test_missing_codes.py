@@ -38,6 +38,16 @@ def test_a_code_of_missing_values_is_named(code, rows):
         observe(with_codes(TEMPERATURES, rows, code))
 
 
+@pytest.mark.parametrize("code", [-99.0, -999.0, 999.0])
+def test_a_usual_code_among_digits_is_named(code):
+    """-99 among 0 to 9 is eleven times their range away, and no outlier."""
+    digits = with_codes(RNG.integers(0, 10, 60).astype(float), [7], code)
+    with pytest.warns(ModelWarning, match=rf"speed = {code:g} in row 7, more than 1\.5 times"):
+        observe(digits)
+    for honest in (-98.0, 90.0):
+        observe(with_codes(digits, [7], honest))
+
+
 def test_a_code_in_data_that_can_be_set_is_named():
     with pytest.warns(ModelWarning, match="speed = -999 in row 0"):
         observe(with_codes(TEMPERATURES, [0], -999.0), lambda data: pm.Data("seen", data))

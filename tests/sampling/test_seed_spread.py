@@ -95,6 +95,13 @@ def test_acceptance_share_is_that_of_a_chain_on_the_noise_alone(variance):
     np.testing.assert_allclose(acceptance_share(variance), law @ move @ law, rtol=1e-4)
 
 
+def test_a_share_that_a_dozen_estimates_cannot_tell_is_no_number():
+    """At 90 it would be 2e-11, where a chain with skewed errors accepted 6 %."""
+    text = variance_advice(of_variance(90.0), "at the start", 0)
+    assert "accepts few of the moves that it would accept with an exact likelihood" in text
+    assert "accepts about 0.02 of the moves" in variance_advice(of_variance(11.0), "here", 0)
+
+
 @pytest.mark.parametrize("variance", [0.0, 0.05, 1.0, 3.3, 10.0])
 def test_nothing_is_said_of_a_fair_spread(variance):
     assert variance_advice(of_variance(variance), "at the start", 0) is None

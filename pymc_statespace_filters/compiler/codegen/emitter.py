@@ -24,6 +24,7 @@ from ..numerics.quantiles.binomial import bernoulli_quantile, binomial_quantile
 from ..numerics.quantiles.gamma import gamma_quantile
 from ..numerics.quantiles.normal import normal_probability
 from ..numerics.quantiles.poisson import poisson_quantile
+from . import trigamma as trigamma  # of which PyTensor's numba has no machine code
 from .expressions import BOOLEAN, FLOAT, INTEGER, Expression, Value, in_order, kind_of
 from .function_types import jit
 from .machine_code import BOOL, DOUBLE, INT, Module

@@ -27,6 +27,8 @@ from .gradient import DensityGradient
 
 Array = NDArray[np.float64]
 
+_OFF_LEVEL = 1e-3  # how far from a user's point, where the density is level there
+
 
 @keeps_what_is_there
 def sample_nuts(
@@ -39,9 +41,10 @@ def sample_nuts(
     progressbar = options.progressbar
     rng = np.random.default_rng(request.entropy)
     target = Target(model, None, RandomWalkSettings())
-    start = _start(model, target, request, rng, name, progressbar=bool(progressbar))
+    density = DensityGradient(model, target.raveled)
+    start = _start(model, target, density, request, rng, name, progressbar=bool(progressbar))
     chains = run_nuts(
-        DensityGradient(model, target.raveled),
+        density,
         start,
         target.raveled.dim,
         request,
@@ -111,6 +114,7 @@ def _tree(model: Model, target: Target, chains: NutsChains, request: SamplingReq
 def _start(
     model: Model,
     target: Target,
+    density: DensityGradient,
     request: SamplingRequest,
     rng: np.random.Generator,
     name: str,
@@ -124,8 +128,12 @@ def _start(
     initvals = request.initvals
     if initvals is not None or not target.prior_draws.may_start:
         point = make_initial_point_fn(model=model, overrides=dict(initvals or {}))
-        centre, width = target.raveled.ravel(point(0)), 0.0 if initvals else 1.0
-        return lambda own: centre + own.uniform(-width, width, centre.size)
+        centre, width = target.raveled.ravel(point(0)), np.ones(target.raveled.dim)
+        if initvals:
+            # From where the density is level along an element, nutpie knows no scale of it.
+            _, gradient = density.for_a_thread()(centre)
+            width = np.where(gradient == 0.0, _OFF_LEVEL, 0.0)
+        return lambda own: centre + own.uniform(-width, width)
     target.prepare()
     population = find_population(target, rng, progressbar=progressbar)
     tell(SeparateModes(model, target.raveled, population), of_model(name))

@@ -99,8 +99,11 @@ class EndedRun(ChainFact):
         Whether the posterior and its filters are to be checked.
     level : str
         Of the report.
+    goes_on : bool
+        Whether `sample(continue_from=)` takes the draws.
     """
 
+    goes_on = False
     model: Model
     target: Target | RecordTarget
     request: SamplingRequest
@@ -135,6 +138,7 @@ class EndedDram(EndedRun):
         That of the estimates at the highest draw, and whose it is.
     """
 
+    goes_on = True
     lengths: Sequence[int]
     is_complete: bool
     chains: Mapping[int, EndedChain]

@@ -1,0 +1,59 @@
+"""NUTS from points of the user, and what its report says of data that were doubted before."""
+
+import logging
+
+import numpy as np
+import pymc as pm
+import pytest
+
+import pymc_statespace_filters as psf
+
+STEPS = np.arange(1, 41)
+WALK = psf.StateSpaceModel(
+    lambda x, q, a: [a * x[0] + q[0]],
+    process_noise=[[1.0]],
+    observation=lambda x: [x[0]],
+    observation_noise=[[0.5]],
+    initial_mean=[0.0],
+    initial_cov=[[1.0]],
+)
+
+
+def model(**changes):
+    """Two parameters, of which the data say nothing about the second."""
+    simulated = psf.simulate(WALK, {"a": 0.8}, steps=STEPS, random_seed=0)
+    observed = simulated["observations"].values.copy()
+    for row, value in changes.items():
+        observed[int(row.removeprefix("row"))] = value
+    with pm.Model() as found:
+        a, z = pm.Normal("a", 0.0, 1.0), pm.Normal("z", 0.0, 1.0)
+        pm.Deterministic("both", a + z)
+        psf.StateSpace("d", WALK, psf.EKF(), steps=STEPS, observed=observed)
+    return found
+
+
+def test_a_start_where_the_density_is_level_is_taken():
+    """The mode of a prior, at which nutpie finds no scale."""
+    idata = psf.sample(
+        1000, sampler="nuts", model=model(), initvals={"a": 0.8, "z": 0.0}, random_seed=1,
+        progressbar=False,
+    )  # fmt: skip
+    z = idata["posterior"]["z"].values
+    assert abs(z.mean()) < 5 / np.sqrt(2000)
+    assert z.std() == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("sampler", ["nuts", "dram"])
+def test_no_problems_are_found_only_where_the_data_were_not_doubted(sampler, caplog):
+    said = []
+    for value in (0.3, -999.0):
+        if value < 0:
+            with pytest.warns(psf.errors.ModelWarning, match="= -999 in row 5"):
+                doubted = model(row5=value)
+        else:
+            doubted = model(row5=value)
+        caplog.clear()
+        with caplog.at_level(logging.DEBUG, logger="pymc"):
+            psf.sample(1000, sampler=sampler, model=doubted, random_seed=1, progressbar=False)
+        said.append("No problems found" in caplog.text)
+    assert said == [True, False]
