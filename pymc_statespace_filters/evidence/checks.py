@@ -31,6 +31,7 @@ from scipy.stats import rankdata
 
 from ..lower_chains import lower_chains
 from ..pymc_model.density import RowFunction
+from ..pymc_model.elements import labels_of
 from ..pymc_model.posterior_draws import are_populations
 from ..pymc_model.step_refinement import densities_by_steps, step_stability
 from .observed_data import scalar_count
@@ -158,9 +159,8 @@ def _scalars(
     for rv in model.free_RVs:
         values = idata["posterior"][rv.name].transpose("chain", "draw", ...).values
         values = values.reshape(-1, *values.shape[2:])[chosen]
-        for index in np.ndindex(values.shape[1:]):
-            label = f"[{', '.join(map(str, index))}]" if index else ""
-            yield f"{rv.name}{label}", values[(slice(None), *index)]
+        labels = labels_of(rv.name, values.shape[1:], model)
+        yield from zip(labels, values.reshape(len(chosen), -1).T, strict=True)
 
 
 def _separation(values: Array, affected: NDArray[np.bool_]) -> float:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
 from ...errors import DataMismatchError
-from ...importance import log_mean, log_mean_of_draws
+from ...importance import bridge_constant, log_mean, log_mean_of_draws
 from ..posterior import Posterior
 from .stopping import ratio_of_errors
 from .whitening import BLOCK, NormalProposals, Whitening, moments
@@ -28,7 +28,6 @@ N_REPEATS = 20  # fresh estimates averaged into f(x*) of a noisy likelihood
 N_CLUSTERS = 2
 N_CLUSTERED = 4000  # draws to be clustered, at most
 HOLE = 0.1  # quantile of the draws' log-densities below which a centre lies in a hole
-N_ITERATIONS = 30
 MAX_LOG = 200.0  # avoids overflow of a useless relative variance
 MIN_PROPOSALS = 500  # of the default
 MAX_ERROR_RATIO = 1 / 3  # error of the denominator over that of the numerator
@@ -156,21 +155,15 @@ def _candidates(posterior: Posterior, rng: np.random.Generator) -> list[Proposal
 def _pilot(posterior: Posterior, pilot: NormalProposals) -> float:
     """Estimate the log-evidence roughly, by bridge sampling to the Gaussian of the draws.
 
-    The iteration of Meng and Wong (1996), which needs no centre x*.
+    It needs no centre x*.
     """
     draws = posterior.draws.reshape(-1, posterior.draws.shape[-1])
     normal = Proposal(pilot.moments.mean, 0.0, pilot.moments.chol)
     sampled, at_sampled = pilot.first(N_PILOT)
     ratio_drawn = posterior.log_density.ravel() - normal.log_q(draws)
-    ratio_sampled = at_sampled - normal.log_q(sampled)
-    log_evidence = float(np.median(ratio_drawn))
-    if np.isneginf(ratio_sampled).all():
-        return log_evidence
-    for _ in range(N_ITERATIONS):
-        upper = ratio_sampled - np.logaddexp(ratio_sampled, log_evidence)
-        lower = -np.logaddexp(ratio_drawn, log_evidence)
-        log_evidence = log_mean(upper) - log_mean(lower)
-    return log_evidence
+    if np.isneginf(at_sampled).all():
+        return float(np.median(ratio_drawn))
+    return bridge_constant(ratio_drawn, at_sampled - normal.log_q(sampled), 0.0)
 
 
 def _predicted_variances(
