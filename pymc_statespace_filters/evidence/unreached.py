@@ -9,15 +9,13 @@ as it does where the peak is so high that no width of floating-point numbers mak
 """
 
 import math
-from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..importance import log_mean
 from ..lower_chains import TOLERATED
-from .estimators.newton import EdgeError, derivatives
+from .estimators.newton import BatchFunction, EdgeError, along, derivatives
 from .posterior import Posterior
 
 N_REPEATED = 40  # fresh estimates of a noisy likelihood
@@ -58,7 +56,7 @@ def check_reached(
     )
 
 
-def log_mass_at(log_density: Callable[[Array], Array], start: Array, spread: Array) -> float | None:
+def log_mass_at(log_density: BatchFunction, start: Array, spread: Array) -> float | None:
     """Log-mass of the normal distribution at the mode near ``start`` (k,); None if there is none.
 
     Newton steps in scales that follow the curvature, from widths of a nat along each axis, found
@@ -68,9 +66,7 @@ def log_mass_at(log_density: Callable[[Array], Array], start: Array, spread: Arr
     scale = _widths(log_density, start, spread)
     for _ in range(N_STEPS):
         try:
-            gradient, hessian = derivatives(
-                partial(_along, log_density, point, scale), np.zeros(k), STEP
-            )
+            gradient, hessian = derivatives(along(log_density, point, scale), np.zeros(k), STEP)
         except EdgeError:
             return None
         curvature, directions = np.linalg.eigh(-hessian)
@@ -88,12 +84,7 @@ def log_mass_at(log_density: Callable[[Array], Array], start: Array, spread: Arr
     return None
 
 
-def _along(log_density: Callable[[Array], Array], point: Array, scale: Array, z: Array) -> Array:
-    """The function in coordinates z (m, k) of x = point + scale z."""
-    return log_density(point + z @ scale.T)
-
-
-def _widths(log_density: Callable[[Array], Array], point: Array, spread: Array) -> Array:
+def _widths(log_density: BatchFunction, point: Array, spread: Array) -> Array:
     """A diagonal scale (k, k): the longest moves along the axes that change little, both ways."""
     k = len(point)
     moves = (LENGTHS[:, None, None] * np.diag(spread)).reshape(-1, k)
