@@ -296,15 +296,15 @@ GRADIENTS = {
     "rate and total": ("EKF", "UKF"),
     "ring": ("EKF",),
 }
-CHAINS: dict[str, tuple[str, str, psf.RandomWalkSettings | None]] = {
+CHAINS: dict[str, tuple[str, str, dict | None]] = {
     "EKF": ("linear", "EKF", None),
-    "EKF in one stage": ("oscillator", "EKF", psf.RandomWalkSettings(stages=1)),
+    "EKF in one stage": ("oscillator", "EKF", {"stages": 1}),
     "BootstrapPF": ("double well", "BootstrapPF systematic", None),
-    "held noise": ("linear", "EnKF ensemble", psf.RandomWalkSettings(refresh_noise=False)),
+    "held noise": ("linear", "EnKF ensemble", {"refresh_noise": False}),
     "correlated noise": (
-        "linear", "BootstrapPF sorted", psf.RandomWalkSettings(stages=1, correlation=0.9),
+        "linear", "BootstrapPF sorted", {"stages": 1, "correlation": 0.9},
     ),
-    "screened": ("double well", "GuidedPF", psf.RandomWalkSettings(screen=psf.EKF())),
+    "screened": ("double well", "GuidedPF", {"screen": psf.EKF()}),
     "counts": ("epidemic", "BootstrapPF systematic", None),
 }  # fmt: skip
 N_DRAWS = 12

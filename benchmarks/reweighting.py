@@ -179,7 +179,7 @@ def all_parameters(case: Case) -> str:
                 200,
                 model=exact,
                 pilot=draws,
-                kernel=psf.RandomWalkSettings(screen=screen),
+                kernel={"screen": screen},
                 **settings,
             )
         )

@@ -138,7 +138,7 @@ def sampling() -> list[Chains]:
         of_runs("psf.sample_dram()", psf.sample_dram),
         of_runs(
             "psf.sample_dram(), one stage",
-            partial(psf.sample_dram, kernel=psf.RandomWalkSettings(stages=1)),
+            partial(psf.sample_dram, kernel={"stages": 1}),
         ),
         by_pymc("pm.sample(step=psf.DRAM())", psf.DRAM),
         by_pymc("pm.sample(step=psf.DRAM(stages=1))", lambda: psf.DRAM(stages=1)),

@@ -84,7 +84,7 @@ def main() -> None:
         print(row("none", model, plan, {}), flush=True)
         for name, screen in SCREENS.items():
             for power in plan.powers:
-                kernel = psf.RandomWalkSettings(screen=screen, screen_power=power)
+                kernel = {"screen": screen, "screen_power": power}
                 settings = {"kernel": kernel}
                 print(row(f"{name}, power {power:g}", model, plan, settings), flush=True)
 

@@ -156,7 +156,7 @@ def oscillator(seed):
         "freeplay": {("slack", "delta_f"): (0.0, 0.5)},
         "hysteresis": {("friction", "delta_h", "a_h"): (0.0, 1.0, 0.5)},
     }
-    kernel = psf.RandomWalkSettings(stages=(3, 1))
+    kernel = {"stages": (3, 1)}
     full, began = model_of(case, psf.EKF()), time.process_time()
     # Chains of the full model need a million iterations for 100 effective draws.
     idata = psf.sample_smc(1000, model=full, random_seed=seed, progressbar=False)

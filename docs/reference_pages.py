@@ -34,7 +34,7 @@ GROUPS = {
         "mechanics.hysteresis_branch",
         "mechanics.polynomial_terms",
     ),
-    "Parts of Markov chains": ("stationary",),
+    "Parts of Markov chains": ("system.stationary",),
     "Parts of compartment models": (
         "compartments.euler_multinomial",
         "compartments.gamma_white_noise",
@@ -65,8 +65,6 @@ GROUPS = {
         "sample_dram",
         "sample_smc",
         "extend",
-        "RandomWalkSettings",
-        "Ranks",
         "DRAM",
         "find_starts",
         "suggest_particles",
@@ -80,7 +78,7 @@ GROUPS = {
         "forecast",
         "free_run",
         "filter_diagnostics",
-        "drift_scan",
+        "diagnostics.drift_scan",
         "check_filter",
         "compute_log_likelihood",
         "leave_future_out",
@@ -88,7 +86,6 @@ GROUPS = {
     "Evidence and model choice": (
         "estimate_evidence",
         "compare_evidence",
-        "compare_prequential",
         "average_models",
         "prior_sensitivity",
         "drift_evidence",
@@ -101,7 +98,6 @@ GROUPS = {
     "Plots": (
         "plot_states",
         "plot_forecast",
-        "plot_predictive",
         "plot_residuals",
         "plot_filter_health",
         "plot_drift",

@@ -2,7 +2,6 @@ from . import compartments, errors, mechanics
 from .diagnostics import (
     check_filter,
     compute_log_likelihood,
-    drift_scan,
     filter_diagnostics,
     leave_future_out,
 )
@@ -32,8 +31,7 @@ from .filters import (
     GuidedPF,
     PFEnKF,
 )
-from .parallel.ranks import Ranks
-from .parameter_particles import compare_prequential, extend, sample_smc
+from .parameter_particles import extend, sample_smc
 from .plots import (
     plot_average,
     plot_drift,
@@ -41,7 +39,6 @@ from .plots import (
     plot_filter_health,
     plot_forecast,
     plot_model_probabilities,
-    plot_predictive,
     plot_prequential,
     plot_prior_sensitivity,
     plot_residuals,
@@ -53,7 +50,6 @@ from .pymc_model.distribution import StateSpace
 from .rivals import run_models
 from .sampling import (
     DRAM,
-    RandomWalkSettings,
     find_starts,
     sample,
     sample_dram,
@@ -72,7 +68,6 @@ from .system.integrators import (
 )
 from .system.model import StateSpaceModel
 from .system.panel_frame import panel_from
-from .system.stationary import stationary
 from .system.steps import nearest_steps
 from .terms import select_terms
 
@@ -97,8 +92,6 @@ __all__ = [
     "OrnsteinUhlenbeck",
     "PFEnKF",
     "RandomWalk",
-    "RandomWalkSettings",
-    "Ranks",
     "RungeKutta4",
     "SemiImplicitEuler",
     "StateSpace",
@@ -107,11 +100,9 @@ __all__ = [
     "check_filter",
     "chib_jeliazkov",
     "compare_evidence",
-    "compare_prequential",
     "compartments",
     "compute_log_likelihood",
     "drift_evidence",
-    "drift_scan",
     "drifting",
     "errors",
     "estimate_evidence",
@@ -133,7 +124,6 @@ __all__ = [
     "plot_filter_health",
     "plot_forecast",
     "plot_model_probabilities",
-    "plot_predictive",
     "plot_prequential",
     "plot_prior_sensitivity",
     "plot_residuals",
@@ -149,7 +139,6 @@ __all__ = [
     "select_terms",
     "simulate",
     "smoothed_states",
-    "stationary",
     "step_error",
     "suggest_particles",
 ]

@@ -24,7 +24,6 @@ from .sampling.run.driver import sample_models
 from .sampling.run.request import RunArguments
 from .sampling.run.stopping import AUTO
 from .sampling.run.warm_start import warm_started_models
-from .sampling.target.settings import FORMER_ARGUMENTS
 
 _OF_SAMPLE = {"model", "sampler", "continue_from", "checkpoint", "comm"}
 _SAMPLERS = {
@@ -50,7 +49,7 @@ def run_models(
 ) -> dict[str, DataTree] | None: ...
 
 
-@former_names(**FORMER_ARGUMENTS)
+@former_names
 @keeps_what_is_there
 def run_models(
     models: Mapping[str, Model],

@@ -2,9 +2,9 @@
 
 from dataclasses import fields
 
-import pymc_statespace_filters as psf
+from pymc_statespace_filters.sampling.target.settings import RandomWalkSettings
 
-_OF_KERNEL = {field.name for field in fields(psf.RandomWalkSettings)}
+_OF_KERNEL = {field.name for field in fields(RandomWalkSettings)}
 
 
 def with_kernel(settings):
@@ -13,5 +13,5 @@ def with_kernel(settings):
     rest = {name: value for name, value in settings.items() if name not in _OF_KERNEL}
     ranks = {name: rest.pop(name) for name in ("per_chain", "gather") if name in rest}
     if ranks:
-        rest["comm"] = psf.Ranks(rest.get("comm"), **ranks)
-    return rest | ({"kernel": psf.RandomWalkSettings(**of_kernel)} if of_kernel else {})
+        rest["comm"] = {"comm": rest.get("comm"), **ranks}
+    return rest | ({"kernel": of_kernel} if of_kernel else {})

@@ -2,6 +2,8 @@
 
 import doctest
 import inspect
+import subprocess
+import sys
 from importlib.util import module_from_spec, spec_from_file_location
 from operator import attrgetter
 from pathlib import Path
@@ -9,6 +11,8 @@ from pathlib import Path
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.former_names import NAMES
+from tests.waiting import LIMIT
 
 PACKAGE = psf.__name__
 
@@ -30,6 +34,9 @@ def test_the_reference_lists_every_public_name_once():
     assert set(LISTED) - PAGES.public_names() == {
         "evidence.Evidence",
         "point_estimation.MaximumLikelihoodEstimate",
+        # Few need these: they have no name at the top.
+        "diagnostics.drift_scan",
+        "system.stationary",
     }
     assert PAGES.public_names() <= set(LISTED)
 
@@ -52,6 +59,8 @@ def test_every_public_name_is_documented_with_an_example(name):
         ("ModelError", "errors"),
         ("Evidence", "evidence"),
         ("MaximumLikelihoodEstimate", "point_estimation"),
+        ("drift_scan", "diagnostics"),
+        ("stationary", "system"),
     ],
 )
 def test_a_moved_name_says_where_it_went(name, place):
@@ -62,6 +71,15 @@ def test_a_moved_name_says_where_it_went(name, place):
         exec(f"from {PACKAGE} import {name}")
     exec(f"from {PACKAGE}.{place} import {name}")
     assert not hasattr(psf, name)
+
+
+def test_an_old_name_is_none_of_today():
+    assert not NAMES.keys() & set(psf.__all__)
+
+
+def test_a_place_is_there_before_anything_of_it_is_used():
+    script = f"import {PACKAGE} as psf; psf.diagnostics.drift_scan, psf.system.stationary"
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=LIMIT)
 
 
 def test_an_unknown_name_is_unknown():

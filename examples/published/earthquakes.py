@@ -39,7 +39,7 @@ def chain(n: int) -> psf.StateSpaceModel:
         transition=lambda x, q: [q[0]],
         process_dist=lambda x, P: [pm.Categorical.dist(P[pt.cast(x[0], "int64")])],
         observation_dist=lambda x, means: [pm.Poisson.dist(means[pt.cast(x[0], "int64")])],
-        initial_dist=lambda P: [pm.Categorical.dist(psf.stationary(P))],
+        initial_dist=lambda P: [pm.Categorical.dist(psf.system.stationary(P))],
         states=["regime"],
         observables=["count"],
         shapes={"P": (n, n), "means": (n,)},

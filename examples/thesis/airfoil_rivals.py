@@ -28,7 +28,7 @@ SCALES = {"k_alpha": 10, "c_alpha": 0.1, "gust": 0.3, "k_3": 5000, "k_f": 100, "
 # where those of the EKF end. With so few members the log-likelihood of a precise record varies by
 # nats from seed to seed; a chain that changes its noise a little at a time sees only part of that.
 ENKF_SHARE, ENKF_TUNE = 5, 300
-MOVED_NOISE = {"kernel": psf.RandomWalkSettings(stages=1, correlation=0.97)}
+MOVED_NOISE = {"kernel": {"stages": 1, "correlation": 0.97}}
 
 NEW_SPEED, NEW_STEPS, N_PATHS = 17.0, round(4.0 / DT), 400
 ANGLES = np.deg2rad(np.linspace(-10, 10, 41))

@@ -159,7 +159,7 @@ def sample(
         one = named[filter, equation]
         if filter in PILOTED:
             pilot = draws[named[PILOTED[filter], equation]]
-            kernel = psf.RandomWalkSettings(stages=1)
+            kernel = {"stages": 1}
             draws[one] = settings.sample(f"{name} {one}", model, pilot=pilot, kernel=kernel)
         evidence = settings.evidence(f"{name}/{one}", draws[one], model)
         found[filter, equation] = Posterior(draws[one], evidence)

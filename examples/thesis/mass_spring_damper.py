@@ -70,7 +70,7 @@ def chains(
     # The noise of a filter is held fixed: another seed changes the log-likelihood by some 0.2, and
     # a new seed for each evaluation would nearly double the time of an EnKF.
     stages = (2, 1) if pilot is None else 1
-    kernel = psf.RandomWalkSettings(stages=stages, refresh_noise=False, screen=screen)
+    kernel = {"stages": stages, "refresh_noise": False, "screen": screen}
     return run.sample(f"{case.slug}_{name}", model, pilot=pilot, kernel=kernel, **settings)
 
 

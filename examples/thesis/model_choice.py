@@ -114,7 +114,7 @@ def pilots(settings: Study, record: str, width: float = 1.0) -> dict[str, Sample
             f"{place}/{variant}",
             model_of(RECORDS[record], psf.EKF(), VARIANTS[variant], wider=width),
             bridge=not settings.quick,
-            kernel=psf.RandomWalkSettings(stages=(3, 1)),
+            kernel={"stages": (3, 1)},
             **(QUICK_PILOT if settings.quick else PILOT),
         )
         for variant in VARIANTS
@@ -141,7 +141,7 @@ def refined(
             n_proposals=max(2000, settings.draws // 10),
             bridge=(record, variant) == BRIDGED and isinstance(filter, psf.EnKF),
             pilot=sampled.idata,
-            kernel=psf.RandomWalkSettings(screen=psf.EKF(), stages=1),
+            kernel={"screen": psf.EKF(), "stages": 1},
         )
     return found
 

@@ -81,7 +81,7 @@ def check_threads() -> None:
             "(MPI_THREAD_MULTIPLE), but it was initialized for a lower thread level. Leave "
             "`mpi4py.rc.threads` and `mpi4py.rc.thread_level`, or the variables MPI4PY_RC_THREADS "
             "and MPI4PY_RC_THREAD_LEVEL, at their defaults; if they are, use another MPI library, "
-            "or psf.Ranks(per_chain=1)."
+            "or per_chain of 1."
         )
 
 

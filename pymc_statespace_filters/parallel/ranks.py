@@ -1,6 +1,7 @@
 """Over which ranks of MPI chains or rows are distributed, and how."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from typing import Any, Self
 
 import numpy as np
@@ -12,7 +13,7 @@ _GATHER = ("root", "all")
 
 @dataclass(frozen=True)
 class Ranks:
-    """Ranks over which chains are distributed: ``comm=`` of the samplers.
+    """What a user gives as ``comm=`` of a sampler, a mapping of these fields for example.
 
     Parameters
     ----------
@@ -32,8 +33,7 @@ class Ranks:
 
     Examples
     --------
-    >>> import pymc_statespace_filters as psf
-    >>> psf.Ranks(per_chain=2)
+    >>> Ranks.of({"per_chain": 2})
     Ranks(comm='world', per_chain=2, gather='root')
     """
 
@@ -51,7 +51,12 @@ class Ranks:
     @classmethod
     def of(cls, comm: Any) -> Self:
         """The ranks that a user has given; None is this process alone."""
-        return comm if isinstance(comm, cls) else cls(comm)
+        if not isinstance(comm, Mapping):
+            return cls(comm)
+        known = [field.name for field in fields(cls)]
+        if not set(comm) <= set(known):
+            raise ModelError(f"comm must be a mapping of some of {', '.join(known)}, got {comm!r}")
+        return cls(**comm)
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from ..filters.protocol import Filter
 from ..importance import normalised
 from ..pymc_model.held_seed import INSIDE
 from ..pymc_model.inspection import exactness, filters_used, noise_seeds
-from ..pymc_model.posterior_draws import BY_PARTICLES
+from ..pymc_model.posterior_draws import BY_PARTICLES, COURSE
 from ..pymc_model.prior import Support
 from ..sampling.output.datatree import to_datatree
 from ..sampling.output.deterministics import Deterministics
@@ -31,7 +31,7 @@ from ..unvisited.sentences import store as store_unvisited
 from .request import Request, Run, least_alive
 
 ESTIMATOR = "smc"
-COURSE, ERRORS = "smc", "mcse"
+ERRORS = "mcse"
 # Relative, of the evidences of the populations. Of runs of `benchmarks.smc` that are right it marks
 # 17 of 113 with 200 draws, and 8 of 119 with 1000. Populations that have all lost a mode agree.
 MAX_SPREAD = 0.7

@@ -101,7 +101,7 @@ def sample_smc(
         a row of "sequential". If the process ends for any reason, the same call goes on from there,
         on any number of ranks, to the same result. It is refused for another model, other data or
         other arguments.
-    comm : mpi4py.MPI.Comm, "world" or Ranks, optional
+    comm : mpi4py.MPI.Comm, "world" or mapping, optional
         Ranks that evaluate the particles together, as `sample_dram` takes them; the result does not
         depend on their number.
 
@@ -158,7 +158,7 @@ def sample_smc(
     See Also
     --------
     extend : More rows for a sequential run.
-    compare_prequential : Rival models row by row.
+    compare_evidence : Rival models, also row by row.
     sample : Chains, which take fewer evaluations for one posterior.
     estimate_evidence : The evidence from draws of any sampler.
     plot_prequential : Which rows speak for which model.

@@ -10,9 +10,9 @@ from pymc.stats.convergence import SamplerWarning, WarningType, log_warnings
 from ..evidence.observed_data import Observed
 from ..filters.written import short_form
 from ..progress import stage_progress
-from ..pymc_model.posterior_draws import SEQUENTIAL
+from ..pymc_model.posterior_draws import COURSE, SEQUENTIAL
 from .observed_rows import ObservedRows
-from .output import COURSE, DoubtsOf, as_datatree
+from .output import DoubtsOf, as_datatree
 from .request import Request
 from .sequential_run import Progress, advance
 from .stored_run import GROUP, arrays_of_progress, stored

@@ -21,13 +21,13 @@ from ..errors import DataMismatchError, ModelError
 from ..filters.written import filter_from
 from ..pymc_model.filter_rows import Record
 from ..pymc_model.other_filter import model_with
+from ..pymc_model.posterior_draws import COURSE
 from ..smc.bridge import Cloud
 from ..smc.moves import Size
 from ..smc.particles import Particles, Populations
 from ..system.clock import Clock
 from ..system.graph_digest import described, digest, graph_digest
 from .observed_rows import ObservedRows
-from .output import COURSE
 from .request import Request
 from .sequential_run import Progress, RowCourse, n_members
 

@@ -5,7 +5,6 @@ from .drift import plot_drift
 from .evidence import plot_evidence, plot_model_probabilities
 from .filter_health import plot_filter_health
 from .forecast import plot_forecast
-from .predictive import plot_predictive
 from .prequential import plot_prequential
 from .prior_sensitivity import plot_prior_sensitivity
 from .residuals import plot_residuals
@@ -19,7 +18,6 @@ __all__ = [
     "plot_filter_health",
     "plot_forecast",
     "plot_model_probabilities",
-    "plot_predictive",
     "plot_prequential",
     "plot_prior_sensitivity",
     "plot_residuals",

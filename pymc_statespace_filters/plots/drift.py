@@ -24,7 +24,7 @@ TURN = {"color": "C1", "diameter": 6}
 MOST_PANELS = 12
 
 
-@former_names(records="give record=, the label of one")
+@former_names
 def plot_drift(
     scan: pd.DataFrame,
     *,
@@ -82,7 +82,7 @@ def plot_drift(
     ...         "d", system, psf.EKF(), steps=range(50), observed=record["observations"]
     ...     )
     ...     estimate = psf.maximum_likelihood(random_seed=1, progressbar=False)
-    ...     scan = psf.drift_scan(estimate, n_simulated=19, random_seed=2)
+    ...     scan = psf.diagnostics.drift_scan(estimate, n_simulated=19, random_seed=2)
     >>> collection = psf.plot_drift(scan)
     >>> collection.savefig("drift.png")  # doctest: +SKIP
     """

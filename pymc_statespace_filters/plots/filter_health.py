@@ -45,7 +45,7 @@ CUT = {"color": "C1", "marker": "C3"}
 LIMIT = {"color": "B1", "linestyle": "C1"}
 
 
-@former_names(records="give record=, the label of one")
+@former_names
 def plot_filter_health(
     idata: xr.DataTree,
     *,

@@ -1,9 +1,10 @@
-"""Plot of forecasts beside the observations."""
+"""Plot of forecasts, or of replicated observations, beside the data."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+import pymc as pm
 import xarray as xr
 from arviz_plots import PlotCollection
 from arviz_plots.visuals import vline
@@ -28,20 +29,21 @@ from .marks import (
     points,
     transformed,
 )
-from .panels import several_records
+from .panels import several_records, with_rows_of_panel
 from .results import SAMPLE_DIMS, data_of, group_of, rename_last_dims, truth_of, variable_of
 
 PAST = 2.0  # length of the observations shown, in lengths of the forecast
 MIN_PAST = 10  # observations
-GROUPS = ("predictions", "free_run")
+GROUPS = ("predictions", "free_run", "posterior_predictive")
 END = {"color": "B2", "linestyle": "C1"}
 
 
-@former_names(record="give records=, a label or several")
+@former_names
 def plot_forecast(
     idata: xr.DataTree,
     *,
     group: str | None = None,
+    model: pm.Model | None = None,
     var_name: str | None = None,
     records: Any = None,
     truth: Any = None,
@@ -54,17 +56,23 @@ def plot_forecast(
     """Plot predicted observations, one panel per observable.
 
     Bands contain 50 % and 90 % of the draws of a group, after the last observation (`forecast`) or
-    beside the observations (a free run). Those of a forecast include the uncertainty of parameters
-    and states, the process noise and the observation noise. A vertical line marks the last
-    observation. Of a panel, each record has panels of its own. Units are taken from the results as
-    in `plot_states`.
+    beside the observations: of a free run, or of the whole new records of
+    ``pm.sample_posterior_predictive``. They include the uncertainty of the parameters, the process
+    noise and the observation noise, those of a forecast that of the states. A vertical line marks
+    the last observation. Of a panel, each record has panels of its own. Units are taken from the
+    results as in `plot_states`.
 
     Parameters
     ----------
     idata : xarray.DataTree
-        Result of `forecast` or of `free_run`.
-    group : {"predictions", "free_run"}, optional
-        The group with the predicted observations; by default the first of these that is there.
+        Result of `forecast` or of `free_run`, or draws with replicated observations.
+    group : {"predictions", "free_run", "posterior_predictive", "prior_predictive"}, optional
+        The group with the predicted observations; by default the first of these that is there,
+        except the last.
+    model : pymc.Model, optional
+        The model, whose records of a panel are then called by labels that are texts, also in groups
+        of PyMC. Otherwise they have numbers there, unless a variable in `idata` has the dimension
+        of the records.
     var_name : str, optional
         Name of the StateSpace variable, if there are several.
     records : label or sequence of labels, optional
@@ -125,6 +133,7 @@ def plot_forecast(
         check_count("n_past", n_past, 0)
     group, results = group_of(idata, *((group,) if group else GROUPS))
     name = variable_of(predicted(results), var_name)
+    idata = with_rows_of_panel(idata, group, name, _labels_of_records(idata, name, model))
     facets = several_records(idata, group, name, name, records)
     idata, truth = facets.idata, facets.truth(truth, "observations")
     results, transform = idata[group].to_dataset(), facets.mapping(transform)
@@ -165,6 +174,15 @@ def plot_forecast(
     label_axes(collection, labels, time, facets.records_of(observables))
     add_legend(collection, lines | bands | legend)
     return collection
+
+
+def _labels_of_records(idata: xr.DataTree, name: str, model: pm.Model | None) -> list[Any] | None:
+    """The labels of the records of a panel, of the model or of a variable that is along them."""
+    dim = f"{name}_record"
+    if model is not None and dim in model.coords:
+        return list(model.coords[dim])
+    found = [node.coords[dim] for node in idata.children.values() if dim in node.coords]
+    return list(found[0].values.tolist()) if found else None
 
 
 def predicted(results: xr.Dataset) -> xr.Dataset:

@@ -8,7 +8,7 @@ import xarray as xr
 from arviz_plots import PlotCollection
 from arviz_plots.plot_collection import backend_from_object
 
-from ..parameter_particles import compare_prequential
+from ..evidence import compare_evidence
 from .canvas import band, curve, interval, label_axes, style_of_curve
 from .legend import add_legend
 from .marks import canvas_over_time
@@ -53,7 +53,7 @@ def plot_prequential(
 
     See Also
     --------
-    compare_prequential : The numbers.
+    compare_evidence : The numbers, with ``by="row"``.
 
     Examples
     --------
@@ -75,7 +75,7 @@ def plot_prequential(
     >>> collection = psf.plot_prequential({"persistent": run(0.9), "alternating": run(-0.9)})
     >>> collection.savefig("prequential.png")  # doctest: +SKIP
     """
-    table = compare_prequential(results).rename(row="time")
+    table = compare_evidence(results, by="row").rename(row="time")
     models = [str(name) for name in table["model"].values]
     first = table[PANELS[0]].isel(model=0, drop=True)
     shape = xr.Dataset({"value": first.expand_dims(panel=list(PANELS))})

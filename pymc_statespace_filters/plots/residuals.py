@@ -43,7 +43,7 @@ WIDTH, WIDTH_ALONE, HEIGHT = 4.2, 7.0, 2.6  # inches of a column, of a single on
 N_TICKS = 4  # of the axis of predictions
 
 
-@former_names(records="give record=, the label of one")
+@former_names
 def plot_residuals(
     idata: xr.DataTree,
     *,

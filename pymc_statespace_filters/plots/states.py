@@ -47,7 +47,7 @@ from .results import (
 PATH = {**DRAWS, "width": 1.5}
 
 
-@former_names(record="give records=, a label or several")
+@former_names
 def plot_states(
     idata: xr.DataTree | xr.Dataset,
     *,

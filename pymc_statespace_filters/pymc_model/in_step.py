@@ -52,7 +52,7 @@ def shared_by_ranks[**P, R](function: Callable[P, R]) -> Callable[P, R]:
         given = own.bind(*args, **kwargs)
         ranks = Ranks.of(kwargs["comm"])
         if ranks.per_chain != 1:
-            raise ModelError(f"per_chain of Ranks must be 1 without chains, got {ranks.per_chain}")
+            raise ModelError(f"per_chain of comm must be 1 without chains, got {ranks.per_chain}")
         with communicator_of(ranks.comm) as comm:
             if comm.size == 1:
                 return function(*args, **kwargs)

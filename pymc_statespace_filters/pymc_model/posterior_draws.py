@@ -21,6 +21,7 @@ MIN_DRAWS = 20
 STATES = "sampler_state"  # the group of the last states of chains
 # Values of the attribute ``sampler`` of draws.
 BY_PARTICLES = "smc"  # their filter may not be that of the model
+COURSE = "smc"  # group with the course of their run
 AVERAGED = "select_terms"  # over sub-models
 SEQUENTIAL = "sequential"  # of the attribute ``data`` of `BY_PARTICLES`, of a run that can go on
 

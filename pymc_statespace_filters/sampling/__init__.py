@@ -5,11 +5,9 @@ from .dram_chains import sample_dram
 from .particle_number import suggest_particles
 from .starts.find_starts import find_starts
 from .step import DRAM
-from .target.settings import RandomWalkSettings
 
 __all__ = [
     "DRAM",
-    "RandomWalkSettings",
     "find_starts",
     "sample",
     "sample_dram",

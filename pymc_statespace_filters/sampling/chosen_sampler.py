@@ -21,7 +21,6 @@ from .run.continuation import appended, former_chains
 from .run.driver import sample_models
 from .run.request import RunArguments, SamplingRequest
 from .run.stopping import AUTO, target_ess
-from .target.settings import RandomWalkSettings
 
 _SAMPLERS = ("auto", NUTS, DRAM)
 _NAMES = {DRAM: "DRAM", NUTS: "NUTS"}
@@ -43,7 +42,7 @@ def sample(
     chains: int = 4,
     cores: int | None = None,
     sampler: str = "auto",
-    kernel: RandomWalkSettings | None = None,
+    kernel: Mapping[str, Any] | None = None,
     continue_from: DataTree | None = None,
     initvals: Mapping[str, Any] | Sequence[Mapping[str, Any] | None] | None = None,
     random_seed: int | np.random.Generator | None = None,
@@ -82,8 +81,8 @@ def sample(
         Number of chains, and of those that run at a time. Default: as many as there are processors.
     sampler : {"auto", "nuts", "dram"}
         The sampler, if it is not to be chosen.
-    kernel : RandomWalkSettings, optional
-        Settings of the random walk; with them it is the sampler.
+    kernel : mapping of str to object, optional
+        Settings of the random walk, as in `sample_dram`; with them it is the sampler.
     continue_from : xarray.DataTree, optional
         Draws of an earlier call, or of `sample_dram`, whose chains go on: ``draws`` are appended,
         bit for bit those of one longer run, without a warm-up. Model, data, ``chains`` and

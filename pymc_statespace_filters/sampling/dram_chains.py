@@ -14,7 +14,6 @@ from .checkpoint.checkpoint import checked_folder
 from .run.driver import sample_models
 from .run.request import RunArguments
 from .run.warm_start import warm_started
-from .target.settings import FORMER_ARGUMENTS, RandomWalkSettings
 
 
 @overload
@@ -29,7 +28,7 @@ def sample_dram(
 ) -> DataTree | None: ...
 
 
-@former_names(**FORMER_ARGUMENTS)  # type: ignore[misc]  # overloads name a few arguments
+@former_names  # type: ignore[misc]  # overloads name a few arguments
 def sample_dram(
     draws: int = 1000,
     tune: int = 1000,
@@ -43,7 +42,7 @@ def sample_dram(
     random_seed: int | np.random.Generator | None = None,
     initvals: Mapping[str, Any] | Sequence[Mapping[str, Any] | None] | None = None,
     pilot: DataTree | None = None,
-    kernel: RandomWalkSettings | None = None,
+    kernel: Mapping[str, Any] | None = None,
     progressbar: bool | str = True,
     discard_tuned_samples: bool = True,
     compute_convergence_checks: bool = True,
@@ -111,11 +110,12 @@ def sample_dram(
         model, as that of a smaller model does, the search for starts begins at its draws, completed
         by draws of the prior, and ``tune`` must be positive. Other variables of the pilot are
         ignored. With ``checkpoint`` the pilot must be the same in each call; with ``comm`` all
-        ranks pass it, which ``Ranks(gather="all")`` gives them.
-    kernel : RandomWalkSettings, optional
-        Settings of the random walk. Where records are moved one by one, ``stages`` must be 1 or the
-        default, ``screen`` and ``correlation`` None, and of ``proposal_cov`` each block takes its
-        own part.
+        ranks pass it, which ``{"gather": "all"}`` gives them.
+    kernel : mapping of str to object, optional
+        Settings of the random walk: the keywords of `DRAM` from ``stages`` to ``correlation``, as
+        in ``{"stages": 1, "screen": psf.EKF()}``. Where records are moved one by one, ``stages``
+        must be 1 or the default, ``screen`` and ``correlation`` None, and of ``proposal_cov`` each
+        block takes its own part.
     progressbar : bool or str
         As in ``pm.sample``. Beside what that shows, the largest R-hat and the smallest bulk
         effective sample size so far, computed every two seconds, or as often as takes 1 % of the
@@ -135,11 +135,14 @@ def sample_dram(
         A folder in which the chains are stored every few seconds. If the process ends for any
         reason, the same call resumes the run and returns bitwise the same draws as an uninterrupted
         one. With ``comm``, the first rank alone reads and writes it.
-    comm : mpi4py.MPI.Comm, "world" or Ranks, optional
+    comm : mpi4py.MPI.Comm, "world" or mapping, optional
         Ranks over which the chains are distributed; all of them make this call. "world" is all
-        ranks started by ``mpiexec``, or this process alone without ``mpiexec``. `Ranks` says more:
-        how many evaluate the likelihoods of a chain together, and which get the result. The draws
-        do not depend on the number of ranks.
+        ranks started by ``mpiexec``, or this process alone without ``mpiexec``. A mapping says
+        more: ``"comm"``, "world" by default; ``"per_chain"``, the number of ranks that evaluate the
+        likelihoods of a chain together, each on its part of the particles, which divides the number
+        of ranks and is for likelihoods that take seconds, 1 by default; and ``"gather"``, the ranks
+        that get the result, ``"root"`` by default or ``"all"``. The draws do not depend on the
+        number of ranks.
 
     Returns
     -------

@@ -64,10 +64,7 @@ class _Measured(NamedTuple):
         return f"{self.variance:.2g} with {self.n_particles} particles"
 
 
-@former_names(
-    var_name="the table has a row for every noisy variable",
-    max_seconds="it measures two numbers of particles and ends",
-)
+@former_names
 def suggest_particles(
     model: Model | None = None,
     *,

@@ -59,7 +59,7 @@ def filtered_states(
         Whether to add the group to `idata`; otherwise it is returned in a new DataTree.
     progressbar : bool
         Whether to show a progress bar if the work takes more than two seconds.
-    comm : mpi4py.MPI.Comm, "world" or Ranks, optional
+    comm : mpi4py.MPI.Comm, "world" or mapping, optional
         Ranks among which the draws are divided, as in `sample_dram`; the result does not depend
         on their number. A rank whose ``idata`` is None gets that of the first.
 

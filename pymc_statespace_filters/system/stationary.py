@@ -15,8 +15,8 @@ _LEAST = 1e-300  # added to the probability of leaving a value, which may be zer
 def stationary(probabilities: Any) -> TensorVariable:
     """Return the stationary distribution of a Markov chain.
 
-    For a start in ``initial_dist``, ``pm.Categorical.dist(psf.stationary(P))``: the chain has
-    run for a long time before the record begins.
+    For a start in ``initial_dist``, ``pm.Categorical.dist(psf.system.stationary(P))``: the chain
+    has run for a long time before the record begins.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def stationary(probabilities: Any) -> TensorVariable:
     Examples
     --------
     >>> import pymc_statespace_filters as psf
-    >>> psf.stationary([[0.9, 0.1], [0.3, 0.7]]).eval().round(3)
+    >>> psf.system.stationary([[0.9, 0.1], [0.3, 0.7]]).eval().round(3)
     array([0.75, 0.25])
     """
     matrix = as_symbol("probabilities", probabilities)

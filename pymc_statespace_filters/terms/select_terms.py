@@ -75,7 +75,7 @@ def select_terms(
     random_seed : int or numpy.random.Generator, optional
     progressbar : bool
         Whether to show a progress bar if the evaluations take more than two seconds.
-    comm : mpi4py.MPI.Comm, "world" or Ranks, optional
+    comm : mpi4py.MPI.Comm, "world" or mapping, optional
         Ranks among which the evaluations are divided, as in `sample_dram`; the result does not
         depend on their number. A rank whose ``idata`` is None gets that of the first, which makes
         the draws if it has none.

@@ -9,6 +9,7 @@ import pytest
 from scipy.stats import kstest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.diagnostics import drift_scan
 from pymc_statespace_filters.diagnostics.constancy.axis import TimeAxis
 from pymc_statespace_filters.diagnostics.constancy.simulations import ConstancyTest, Statistics
 from pymc_statespace_filters.diagnostics.constancy.statistics import (
@@ -143,7 +144,7 @@ def test_p_values_of_many_constant_records_are_uniform():
 
 
 def test_a_jump_is_found_with_its_time_and_size():
-    scan = psf.drift_scan(Point(), driven_model(jumping(3, to=2.0)), random_seed=1)
+    scan = drift_scan(Point(), driven_model(jumping(3, to=2.0)), random_seed=1)
     first = scan.iloc[0]
     assert scan.index[0] == "gain"
     assert set(scan.index) == {"a", "gain", "sigma"}  # and not the mean of the start
@@ -214,7 +215,7 @@ def test_simulated_data_are_missing_and_unscored_as_the_data():
 def test_draws_and_an_estimate_give_the_same():
     model = driven_model(simulated(2))
     draws = psf.sample_dram(200, tune=200, model=model, random_seed=1, progressbar=False)
-    tables = [psf.drift_scan(one, model, n_simulated=39, random_seed=3) for one in (draws, Point())]
+    tables = [drift_scan(one, model, n_simulated=39, random_seed=3) for one in (draws, Point())]
     statistics = [table["statistic"].sort_index() for table in tables]
     np.testing.assert_allclose(*statistics, rtol=0.1, atol=0.1)
 
@@ -225,7 +226,7 @@ def test_the_record_of_a_panel_that_changes_is_named():
     observed[[5, 130]] = np.nan
     panel = np.repeat(["A", "B", "C"], N_ROWS)
     model = driven_model(observed, panel=panel, steps=np.tile(STEPS, 3), score_from=2)
-    scan = psf.drift_scan(Point(), model, n_simulated=99, random_seed=1)
+    scan = drift_scan(Point(), model, n_simulated=99, random_seed=1)
     first = scan.iloc[0]
     assert (scan.index[0], first["record"]) == ("gain", "B")
     assert first["p_alone"] <= 0.01
@@ -276,29 +277,29 @@ def test_times_of_a_panel_whose_rows_are_data():
 
 def test_chosen_parameters():
     model = driven_model(simulated(2))
-    scan = psf.drift_scan(Point(), model, parameters="gain", n_simulated=19, random_seed=1)
+    scan = drift_scan(Point(), model, parameters="gain", n_simulated=19, random_seed=1)
     assert list(scan.index) == ["gain"]
     assert scan["p_value"].iloc[0] == scan["p_alone"].iloc[0]
     # fixed at a number, of the sensor
-    fixed = psf.drift_scan(Point(), model, parameters=["sensor"], n_simulated=19, random_seed=1)
+    fixed = drift_scan(Point(), model, parameters=["sensor"], n_simulated=19, random_seed=1)
     assert list(fixed.index) == ["sensor"]
 
 
 def test_bad_arguments():
     model = driven_model(simulated(2))
     with pytest.raises(ModelError, match=r"parameters must be some of \['a', .*got \['b'\]"):
-        psf.drift_scan(Point(), model, parameters=["b"])
+        drift_scan(Point(), model, parameters=["b"])
     with pytest.raises(ModelError, match=r"after the start of a record, got \['start'\]"):
-        psf.drift_scan(Point(), model, parameters=["start"])
+        drift_scan(Point(), model, parameters=["start"])
     with pytest.raises(ModelError, match="n_simulated must be an integer of at least 19, got 5"):
-        psf.drift_scan(Point(), model, n_simulated=5)
+        drift_scan(Point(), model, n_simulated=5)
     with pytest.raises(ModelError, match="var_name"):
-        psf.drift_scan(Point(), model, var_name="y")
+        drift_scan(Point(), model, var_name="y")
     with pytest.raises(ModelError, match="idata must be a DataTree"):
-        psf.drift_scan(1.0, model)
+        drift_scan(1.0, model)
     noisy = driven_model(simulated(2), filter=psf.BootstrapPF(100))
     with pytest.raises(ModelError, match=r"must be EKF, UKF or IPLF.*BootstrapPF\(100\)"):
-        psf.drift_scan(Point(), noisy)
+        drift_scan(Point(), noisy)
 
 
 def test_one_that_varies_is_to_be_mended_before_others_are_believed():
@@ -347,9 +348,9 @@ def test_a_noise_at_zero_is_left_out_and_named():
         psf.StateSpace("d", system, psf.EKF(), steps=range(1, 61), observed=observed)
     start = Point()
     start.unconstrained = np.array([0.95, 1e-10])
-    scan = psf.drift_scan(start, model, n_simulated=19, random_seed=1, progressbar=False)
+    scan = drift_scan(start, model, n_simulated=19, random_seed=1, progressbar=False)
     assert list(scan.index) == ["a"]
     assert np.isfinite(scan.paths["cumulated"]).all()
     assert "Left out: s. At the estimate" in repr(scan)
     with pytest.raises(ModelError, match="has an effect on the likelihood at the estimate"):
-        psf.drift_scan(start, model, parameters="s", n_simulated=19)
+        drift_scan(start, model, parameters="s", n_simulated=19)

@@ -30,7 +30,7 @@ def test_the_evidence_is_that_of_the_exact_likelihood():
         idata = psf.sample_dram(
             2000,
             chains=2,
-            kernel=psf.RandomWalkSettings(stages=1, correlation=0.9),
+            kernel={"stages": 1, "correlation": 0.9},
             random_seed=1,
             progressbar=False,
         )

@@ -185,7 +185,7 @@ def regimes(filter):
         transition=lambda x, q: [q[0]],
         process_dist=lambda x, P: [pm.Categorical.dist(at(P, x[0]))],
         observation_dist=lambda x, mean, noise: [pm.Normal.dist(at(mean, x[0]), noise[0])],
-        initial_dist=lambda P: [pm.Categorical.dist(psf.stationary(P))],
+        initial_dist=lambda P: [pm.Categorical.dist(psf.system.stationary(P))],
         shapes={"P": (2, 2), "mean": (2,), "noise": (2,)},
     )
     rng = np.random.default_rng(1)

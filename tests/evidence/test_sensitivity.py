@@ -148,13 +148,6 @@ class TestWhatIsRefused:
         ):
             prior_sensitivity({"line": line.idata}, models={"line": plane.model})
 
-    @pytest.mark.parametrize(
-        ("name", "instead"), [("prior", "give model_prior="), ("exponents", "a model_prior for")]
-    )
-    def test_former_names(self, name, instead):
-        with pytest.raises(TypeError, match=rf"'{name}': .*{instead}"):
-            curves_of({"line": Rival(2, 1)}, **{name: None})
-
 
 class Undetermined:
     """Draws of w, which the data determine, and of k, uniform from 0 to 1."""

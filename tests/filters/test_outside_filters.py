@@ -201,9 +201,7 @@ def test_a_noisy_one_without_anything_else_is_sampled_with_fresh_noise():
         ):
             psf.filtered_states(idata)
         with pytest.raises(psf.errors.ModelError, match="correlation needs a filter whose normals"):
-            psf.sample_dram(
-                5, tune=5, chains=1, kernel=psf.RandomWalkSettings(stages=1, correlation=0.9)
-            )
+            psf.sample_dram(5, tune=5, chains=1, kernel={"stages": 1, "correlation": 0.9})
 
 
 @pytest.mark.parametrize("filter", [psf.EKF, PlainParticles, "EKF", None])

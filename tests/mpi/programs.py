@@ -52,7 +52,7 @@ def failing(chain: str) -> None:
         cores=2,
         model=model,
         initvals=[{"mu": 7.0 if i == int(chain) else 0.0} for i in range(CHAINS)],
-        kernel=psf.RandomWalkSettings(proposal_cov=[[1e-9]]),
+        kernel={"proposal_cov": [[1e-9]]},
         progressbar=False,
         comm="world",
     )

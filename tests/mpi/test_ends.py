@@ -34,7 +34,7 @@ def ends(comm):
         if comm.rank == 0:
             patch.setattr(ChainTask, "run", _fails_when_others_are_done)
         with pytest.raises((ArithmeticError, psf.errors.ParallelError)) as caught:
-            psf.sample_dram(**quick | {"comm": psf.Ranks(comm, gather="all")}, progressbar=False)
+            psf.sample_dram(**quick | {"comm": {"comm": comm, "gather": "all"}}, progressbar=False)
     heard.append(str(caught.value))
 
     made, stop, told, stopped = ChainTask._advance, ChainPool.stop, [], Event()
@@ -57,9 +57,9 @@ def ends(comm):
         tree = psf.sample_dram(
             10**5,
             tune=0,
-            **call | {"comm": psf.Ranks(comm, gather="all")},
+            **call | {"comm": {"comm": comm, "gather": "all"}},
             progressbar=False,
-            kernel=psf.RandomWalkSettings(proposal_cov=[[1.0]]),
+            kernel={"proposal_cov": [[1.0]]},
         )
     heard.append(dict(tree["posterior"].sizes))
     return heard

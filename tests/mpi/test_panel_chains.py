@@ -17,7 +17,7 @@ def draws(comm=None):
         random_seed=4,
         progressbar=False,
         compute_convergence_checks=False,
-        comm=psf.Ranks(comm, gather="all"),
+        comm={"comm": comm, "gather": "all"},
     )
     return {
         (group, name): tree[group][name].values

@@ -69,7 +69,7 @@ def by_sizes(comm):
     for size in (2, FOUR):
         part = comm.Split(comm.rank // size)
         if size == FOUR or comm.rank < 2:
-            ranks = psf.Ranks(part, gather="all")
+            ranks = {"comm": part, "gather": "all"}
             found[size] = results(draws() if part.rank == 0 else None, ranks)
         part.Free()
     return found
@@ -105,7 +105,7 @@ def failures(comm):
                 patch.setattr(ModelPrior, "sample", lambda *given: draw(*given) + 1e-15)
             data = [0.3, 0.4 if is_faulty and fault == "other data" else 1.0]
             settings = SMC | {"random_seed": 1 + (is_faulty and fault == "other seed")}
-            ranks = psf.Ranks(comm, per_chain=2 if fault == "per_chain" else 1)
+            ranks = {"comm": comm, "per_chain": 2 if fault == "per_chain" else 1}
             with pm.Model():
                 pm.Normal("y", pm.Normal("mu"), 1.0, observed=data)
                 try:
@@ -123,7 +123,7 @@ def test_all_ranks_end_with_one():
     assert "ParallelError: rank 1 of 2 and rank 0 have computed different" in first["diverges"]
     for fault, name in {"other data": "data", "other seed": "random_seed"}.items():
         assert f"DataMismatchError: rank 1 of 2 and rank 0 differ in {name};" in first[fault]
-    assert "per_chain of Ranks must be 1 without chains, got 2" in first["per_chain"]
+    assert "per_chain of comm must be 1 without chains, got 2" in first["per_chain"]
     alike = {"diverges", "other data", "other seed", "per_chain"}
     assert all(first[fault] == second[fault] for fault in alike)
 

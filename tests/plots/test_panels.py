@@ -8,7 +8,6 @@ import xarray as xr
 from pymc_statespace_filters import (
     plot_filter_health,
     plot_forecast,
-    plot_predictive,
     plot_residuals,
     plot_states,
 )
@@ -217,7 +216,9 @@ def test_replicated_observations_of_each_record(known_by):
     if known_by == "draws":
         tree["posterior"] = xr.Dataset({"rate": ("d_record", [1.0, 2.0])}, {"d_record": LABELS})
     model = pm.Model(coords={"d_record": LABELS}) if known_by == "model" else None
-    collection = plot_predictive(tree, model=model, backend="matplotlib")
+    collection = plot_forecast(
+        tree, group="posterior_predictive", model=model, backend="matplotlib"
+    )
     for number, label in enumerate(LABELS if known_by else [0, 1]):
         rows = OF_ROWS == LABELS[number]
         where = {"observable": f"{label}: level"}
@@ -229,11 +230,11 @@ def test_replicated_observations_of_each_record(known_by):
 
 
 def test_replicated_observations_of_one_record(forecast_of_past):
-    collection = plot_predictive(forecast_of_past, backend="none")
+    collection = plot_forecast(forecast_of_past, group="posterior_predictive", backend="none")
     assert {"band_90", "band_50", "median", "data"} <= set(collection.viz.children)
     assert "end" not in collection.viz.children
     with pytest.raises(ModelError, match="idata has no group 'prior_predictive'"):
-        plot_predictive(forecast_of_past, group="prior_predictive")
+        plot_forecast(forecast_of_past, group="prior_predictive")
 
 
 @pytest.mark.parametrize("plot", [plot_states, plot_forecast])

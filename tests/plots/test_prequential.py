@@ -37,7 +37,7 @@ NOISY = RIVALS | {"two": course(np.add.outer([0.2, -0.2], [-2.0, -2.0, -3.0]))}
 
 
 def test_numbers():
-    table = psf.compare_prequential(RIVALS)
+    table = psf.compare_evidence(RIVALS, by="row")
     np.testing.assert_allclose(table["score_difference"].sel(model="two"), [-1.0, 1.0, 1.0])
     np.testing.assert_allclose(table["log_bayes_factor"].sel(model="two"), [-1.0, 0.0, 1.0])
     np.testing.assert_allclose(table["score_difference_se"].sel(model="two"), np.hypot(0.1, 0.1))
@@ -48,8 +48,23 @@ def test_numbers():
     np.testing.assert_array_equal(table["row"], ROWS)
 
 
+def test_prior_weights_and_the_probability_of_intervals():
+    even = psf.compare_evidence(NOISY, by="row").sel(model="two")
+    weighted = psf.compare_evidence(
+        NOISY, by="row", model_prior={"one": 1.0, "two": 3.0}, ci_prob=0.5
+    ).sel(model="two")
+    odds = 3.0 * even["probability"] / (1.0 - even["probability"])
+    np.testing.assert_allclose(weighted["probability"], odds / (1.0 + odds))
+    narrow, wide = (one["probability_high"] / one["probability"] for one in (weighted, even))
+    assert (narrow < wide).all()
+    with pytest.raises(ModelError, match="estimator and step_errors must be None by row"):
+        psf.compare_evidence(NOISY, by="row", estimator="bridge")
+    with pytest.raises(ModelError, match="by must be 'model' or 'row', got 'column'"):
+        psf.compare_evidence(NOISY, by="column")
+
+
 def test_errors_widen_bands():
-    table = psf.compare_prequential(NOISY).sel(model="two")
+    table = psf.compare_evidence(NOISY, by="row").sel(model="two")
     assert (table["log_bayes_factor_se"] > 0.2).all()
     assert (table["probability_low"] < table["probability"]).all()
     assert (table["probability_high"] > table["probability"]).all()
@@ -71,11 +86,11 @@ def test_every_backend_draws(backend):
     [
         ({"one": RIVALS["one"]}, ModelError, "at least two models .* got dict of 1"),
         (RIVALS["one"], ModelError, "got DataTree"),
-        (RIVALS | {"two": 3}, ModelError, r"results\['two'\] must be .* got int"),
+        (RIVALS | {"two": 3}, ModelError, "got for 'two' int"),
         (
             RIVALS | {"two": xr.DataTree.from_dict({"smc": xr.Dataset()})},
             ModelError,
-            "got a tempered run",
+            "got for 'two' a tempered run",
         ),
         (
             RIVALS | {"two": course([[-1.0, -2.0]] * 2, ROWS[:2])},

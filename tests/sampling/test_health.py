@@ -216,9 +216,7 @@ def test_a_noisy_start_is_said_where_the_chain_still_stands(caplog, monkeypatch)
     monkeypatch.setattr(noise, "HOPELESS", 1e-3)
     model = state_space_model(psf.BootstrapPF(3))
     with caplog.at_level(logging.WARNING, logger=LOGGER):
-        tree = sample_dram(
-            model, draws=700, tune=0, kernel=psf.RandomWalkSettings(proposal_cov=[[1e12]])
-        )
+        tree = sample_dram(model, draws=700, tune=0, kernel={"proposal_cov": [[1e12]]})
     stood = (tree["sample_stats"]["stage"][:, :100] == 0).all("draw").to_numpy()
     assert stood.any()
     for chain_, has_stood in enumerate(stood):

@@ -350,12 +350,12 @@ def test_a_wrong_record_is_the_leaders_matter_and_can_be_mended():
         (
             MODEL,
             {"correlation": 0.9, "stages": 1},
-            r"per_chain of psf.Ranks must be 1 with correlation=0.9, got 4",
+            r"per_chain of comm must be 1 with correlation=0.9, got 4",
         ),
         (
             two_records(psf.EKF(), psf.EKF()),
             {},
-            r"per_chain of psf.Ranks must be 1 for a model without .* particles, got 4",
+            r"per_chain of comm must be 1 for a model without .* particles, got 4",
         ),
         (MODEL, {}, r"EnKF.* 3 of 4 ranks"),
         (two_records(psf.EKF(), psf.PFEnKF(200)), {}, r"PFEnKF.* 3 of 4 ranks"),

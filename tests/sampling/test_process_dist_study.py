@@ -47,9 +47,7 @@ def model_with(filter):
 def study():
     model = model_with(FILTER)
     settings = {"model": model, "chains": 2, "progressbar": False, "random_seed": 1}
-    return model, psf.sample_dram(
-        200, tune=200, kernel=psf.RandomWalkSettings(screen=psf.EKF()), **settings
-    )
+    return model, psf.sample_dram(200, tune=200, kernel={"screen": psf.EKF()}, **settings)
 
 
 def test_chains_are_exact_and_a_kalman_filter_screens(study):

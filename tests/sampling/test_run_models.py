@@ -137,7 +137,7 @@ def test_an_interrupt_keeps_the_model_that_has_draws(models, monkeypatch, caplog
 def test_messages_name_the_model(caplog):
     models = {"first": normal_model(), "second": normal_model(3.0)}
     psf.run_models(
-        models, **SETTINGS | {"tune": 0}, kernel=psf.RandomWalkSettings(proposal_cov=[[1e12]])
+        models, **SETTINGS | {"tune": 0}, kernel={"proposal_cov": [[1e12]]}
     )  # they stand still
     named = [re.match(r"Model '(\w+)': ", record.message) for record in caplog.records]
     assert {match.group(1) for match in named if match} == set(models)

@@ -1,5 +1,7 @@
 """The front door: thinning, the choice of the sampler, refusals, and what NUTS returns."""
 
+from dataclasses import fields
+
 import numpy as np
 import pymc as pm
 import pytest
@@ -12,6 +14,7 @@ from pymc_statespace_filters.sampling.kernel.state import N_ACCEPTED, N_COUNTS, 
 from pymc_statespace_filters.sampling.output.convergence import convergence
 from pymc_statespace_filters.sampling.output.phase_statistics import PhaseStatistics
 from pymc_statespace_filters.sampling.run.thinned_draws import Thinning, add_iterations, coarsen
+from pymc_statespace_filters.sampling.target.settings import RandomWalkSettings
 from tests.kernels import with_kernel
 from tests.sampling.test_dram import simple_model
 from tests.sampling.test_sample_dram import state_space_model
@@ -252,7 +255,7 @@ def test_chains_that_cannot_go_on(two_parts):
         (other, "of this model"),
         (call | {"chains": 3}, "chains must be that of continue_from, 2, got 3"),
         (call | {"random_seed": 1}, "random_seed must be None with continue_from"),
-        (call | {"kernel": psf.RandomWalkSettings(stages=1)}, "kernel must be as in the run"),
+        (call | {"kernel": {"stages": 1}}, "kernel must be as in the run"),
         (call | {"sampler": "nuts"}, "continue_from must be None with sampler='nuts'"),
     ]
     for arguments, message in refused:
@@ -272,7 +275,7 @@ def test_chains_that_cannot_go_on(two_parts):
 
 REFUSALS = [
     ({"sampler": "gibbs"}, r"sampler must be one of .* got 'gibbs'"),
-    ({"sampler": "nuts", "kernel": psf.RandomWalkSettings()}, r"kernel must be None .*'dram' has"),
+    ({"sampler": "nuts", "kernel": {}}, r"kernel must be None .*'dram' has"),
     ({"sampler": "nuts", "checkpoint": "x"}, "checkpoint must be None with sampler='nuts'"),
     ({"sampler": "nuts", "comm": "world"}, "comm must be None with sampler='nuts'"),
     ({"sampler": "nuts", "initvals": [{}] * 4}, "initvals must be a mapping for sampler='nuts'"),
@@ -283,7 +286,10 @@ REFUSALS = [
         {"draws": 100, "until_ess": 401},
         r"until_ess must be at most .* 4 \* 100, got 401: give more",
     ),
-    ({"kernel": {"stages": 1}}, r"kernel must be psf.RandomWalkSettings\(...\), got"),
+    ({"kernel": {"stage": 1}}, "kernel must be a mapping of some of stages, .*, got .'stage': 1"),
+    ({"kernel": 1}, "kernel must be a mapping of some of .*, or None, got 1"),
+    ({"comm": {"ranks": 2}}, "comm must be a mapping of some of comm, per_chain, gather, got"),
+    ({"comm": {"per_chain": 0}}, "per_chain must be an integer of at least 1, got 0"),
     ({"until_ess": 0}, "until_ess must be"),
     ({"until_ess": None, "max_draws": 5}, "max_draws needs until_ess"),
 ]
@@ -312,21 +318,25 @@ def test_nuts_refuses_noise():
 
 @pytest.mark.parametrize("function", [psf.sample_dram, psf.run_models])
 def test_an_old_spelling_names_the_new_one(function):
-    with pytest.raises(
-        TypeError, match=r"'stages': give kernel=psf.RandomWalkSettings\(stages=...\)"
-    ):
-        function({}, stages=1)
-    with pytest.raises(TypeError, match=r"'gather': give comm=psf.Ranks\(gather=...\)"):
+    for field in fields(RandomWalkSettings):
+        message = rf"'{field.name}': give kernel=\{{\"{field.name}\": ...\}}"
+        with pytest.raises(TypeError, match=message):
+            function({}, **{field.name: 1})
+    with pytest.raises(TypeError, match=r"'gather': give comm=\{\"gather\": ...\}"):
         function({}, gather="all")
     with pytest.raises(TypeError, match=r"unexpected keyword argument 'stage'"):
         function({}, stage=1)
 
 
 def test_settings_are_equal_if_their_values_are():
-    first, second = (psf.RandomWalkSettings(proposal_cov=np.eye(2), stages=1) for _ in range(2))
+    kernel = {"proposal_cov": np.eye(2), "stages": 1}
+    first, second = (
+        RandomWalkSettings.of(kernel),
+        RandomWalkSettings.of(kernel | {"stages": (1, 1)}),
+    )
     assert first == second
     assert hash(first) == hash(second)
-    assert with_kernel({"stages": 1, "proposal_cov": np.eye(2)}) == {"kernel": first}
+    assert with_kernel(kernel) == {"kernel": kernel}
 
 
 def test_a_filter_and_its_evidence_after_nuts():

@@ -97,7 +97,7 @@ def test_are_initial_values_of_both_samplers():
             assert 0.0 < start["below"] < start["scale"]
         settings = {"chains": 2, "initvals": starts, "random_seed": 1, "progressbar": False}
         settings |= {"draws": 4, "tune": 0, "compute_convergence_checks": False}
-        still = psf.RandomWalkSettings(stages=1, proposal_cov=1e-20 * np.eye(4))
+        still = {"stages": 1, "proposal_cov": 1e-20 * np.eye(4)}
         with pytensor.config.change_flags(mode=AS_IT_STANDS):
             chains = psf.sample_dram(kernel=still, **settings)
             pm.sample(step=pm.Metropolis(), cores=1, **settings)

@@ -152,7 +152,9 @@ def drift_scan(
     ...         "d", system, psf.EKF(), steps=range(101), inputs=force, observed=observed
     ...     )
     ...     estimate = psf.maximum_likelihood(random_seed=1, progressbar=False)
-    ...     scan = psf.drift_scan(estimate, n_simulated=199, random_seed=2, progressbar=False)
+    ...     scan = psf.diagnostics.drift_scan(
+    ...         estimate, n_simulated=199, random_seed=2, progressbar=False
+    ...     )
     >>> scan.index[0], bool(scan["p_value"].iloc[0] < 0.02), int(scan["time"].iloc[0])
     ('gain', True, 63)
     """

@@ -3,15 +3,18 @@
 import math
 import warnings
 from collections.abc import Mapping, Sequence
+from typing import Any, Literal, overload
 
 import numpy as np
 import pandas as pd
+import xarray as xr
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from ...errors import EvidenceWarning
+from ...errors import EvidenceWarning, ModelError
 from ...former_names import former_names
 from ..evidence import Evidence
+from .by_row import compare_rows
 from .selection import EvidenceLike, check_ci_prob, prior_weights, probabilities, select_evidences
 from .sentences import needs_warning, sentences, step_error_columns
 from .table import EvidenceTable
@@ -22,18 +25,28 @@ STRENGTHS = {0.0: "barely worth mentioning", 2.0: "positive", 6.0: "strong", 10.
 Array = NDArray[np.float64]
 
 
-@former_names(
-    prior="give model_prior=",
-    correction="give model_prior=, proportional to J^(-k alpha / 2) for k parameters",
-)
+@overload
+def compare_evidence(
+    evidences: Mapping[str, EvidenceLike], *, by: Literal["model"] = ..., **settings: Any
+) -> EvidenceTable: ...
+
+
+@overload
+def compare_evidence(
+    evidences: Mapping[str, EvidenceLike], *, by: Literal["row"], **settings: Any
+) -> xr.Dataset: ...
+
+
+@former_names  # type: ignore[misc]  # overloads name a few arguments
 def compare_evidence(
     evidences: Mapping[str, EvidenceLike],
     *,
+    by: Literal["model", "row"] = "model",
     model_prior: Mapping[str, float] | None = None,
     ci_prob: float = 0.95,
     estimator: str | None = None,
     step_errors: Mapping[str, pd.DataFrame] | None = None,
-) -> EvidenceTable:
+) -> EvidenceTable | xr.Dataset:
     """Compare models by their evidences: probabilities, Bayes factors and criteria (Eq. 3.3).
 
     Parameters
@@ -41,6 +54,10 @@ def compare_evidence(
     evidences : mapping of str to Evidence, xarray.DataTree, or mapping of str to Evidence
         One entry per model, all of the same data: an `Evidence`, a DataTree with the group
         ``evidence``, or the result of `estimate_evidence`.
+    by : {"model", "row"}
+        Whether the models are compared once, or after each row of the data, the others with the
+        first. "row" takes results of `sample_smc` with ``data="sequential"``, or of `extend`, of at
+        least two models of the same rows; it has no `estimator` and no `step_errors`.
     model_prior : mapping of str to float, optional
         Positive prior weight of every model, normalised here; equal by default.
     ci_prob : float
@@ -56,7 +73,7 @@ def compare_evidence(
 
     Returns
     -------
-    pandas.DataFrame
+    pandas.DataFrame or xarray.Dataset
         Index ``model``, most probable first. Its display shows the first five columns, and below
         them sentences: which estimator was chosen, what is undecided, how AIC and BIC disagree with
         the evidence, and the reason of each warning. ``table.to_string()`` shows all columns:
@@ -104,6 +121,13 @@ def compare_evidence(
         are those of the estimates, and all intervals are NaN, because each depends on every
         evidence. Comparisons with that model are undecided, and its ``strength`` ignores errors.
 
+        By row, a Dataset along ``model`` and ``row``: ``score_difference``, of
+        log p(d_j | d_1 .. d_{j-1}) with the parameters integrated out, and its sum so far,
+        ``log_bayes_factor``, each with its standard error ``_se``; ``probability``, with the ends
+        ``probability_low`` and ``probability_high`` of its interval. The errors of scores are
+        correlated: their sum has the error of the evidence, not that of independent numbers. For
+        the sum over other rows see ``score_deviation`` of `sample_smc`.
+
     Raises
     ------
     ModelError
@@ -142,8 +166,14 @@ def compare_evidence(
       n_observations, bic, undecided, aic, log_evidence_flat, prior, strength,
       warning, max_log_likelihood, approximate.
     """
-    found, how_chosen = select_evidences(evidences, estimator)
+    if by not in ("model", "row"):
+        raise ModelError(f"by must be 'model' or 'row', got {by!r}")
     check_ci_prob(ci_prob)
+    if by == "row":
+        if estimator is not None or step_errors is not None:
+            raise ModelError("estimator and step_errors must be None by row")
+        return compare_rows(evidences, model_prior, ci_prob)
+    found, how_chosen = select_evidences(evidences, estimator)
     weights = prior_weights(model_prior, list(found))
     _warn_of_improper(found)
     table = _columns(found, weights, ci_prob)

@@ -11,7 +11,6 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from ...errors import EvidenceWarning, ModelError
-from ...former_names import former_names
 from ...pymc_model.posterior_draws import check_one_model, unconstrained_draws
 from .compare import compare_evidence
 from .scaled_prior import ReweightedEvidence, ScaledPrior
@@ -21,10 +20,6 @@ from .width_curves import curves_of_models, dataset_of_curves, width_factors
 MOSTLY = 0.5  # fraction of the widths other than 1 from which a curve is mostly unknown
 
 
-@former_names(
-    prior="give model_prior=",
-    exponents="give compare_evidence a model_prior for each exponent",
-)
 def prior_sensitivity(
     evidences: Mapping[str, EvidenceLike],
     *,

@@ -75,7 +75,7 @@ def reweight(
     cores : int, optional
         Number of threads, on which no number depends; by default one for each core that the process
         may use.
-    comm : mpi4py.MPI.Comm, "world" or Ranks, optional
+    comm : mpi4py.MPI.Comm, "world" or mapping, optional
         Ranks among which the points are divided, as in `sample_dram`; the result does not depend
         on their number. A rank whose ``idata`` is None gets that of the first.
 

@@ -39,7 +39,7 @@ _SEED_ADVICE = (
     ", and the same integer as random_seed: a Generator is the same on two ranks only if both were "
     "made of the same seed and have drawn as much"
 )
-_PILOT_ADVICE = ', and the same pilot, which psf.Ranks(gather="all") gives to all ranks'
+_PILOT_ADVICE = ', and the same pilot, which comm={"gather": "all"} gives to all ranks'
 
 
 @keeps_what_is_there
@@ -152,7 +152,7 @@ def _group_size(per_chain: int, n_ranks: int) -> int:
     size = min(per_chain, n_ranks)
     if n_ranks % size:
         raise ModelError(
-            f"per_chain of Ranks must divide the number of ranks, got per_chain={size} with "
+            f"per_chain of comm must divide the number of ranks, got per_chain={size} with "
             f"{n_ranks} ranks"
         )
     return size

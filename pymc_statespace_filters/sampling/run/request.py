@@ -139,7 +139,7 @@ class RunArguments:
     cores: int | None = None
     random_seed: Any = None
     initvals: Any = None
-    kernel: RandomWalkSettings | None = None
+    kernel: Any = None
     progressbar: bool | str = True
     discard_tuned_samples: bool = True
     compute_convergence_checks: bool = True
@@ -169,9 +169,7 @@ class RunArguments:
                 f"tune={tune}, discard_tuned_samples={not keeps_warmup}; for the warm-up alone "
                 "give discard_tuned_samples=False"
             )
-        kernel = RandomWalkSettings() if self.kernel is None else self.kernel
-        if not isinstance(kernel, RandomWalkSettings):
-            raise ModelError(f"kernel must be psf.RandomWalkSettings(...), got {kernel!r}")
+        kernel = RandomWalkSettings.of(self.kernel)
         enough, most = _stopping_rule(draws, self.until_ess, self.max_draws)
         return SamplingRequest(
             draws,

@@ -58,18 +58,18 @@ def check_group(model: Model, settings: RandomWalkSettings, n_ranks: int) -> Non
     """
     if settings.correlation is not None:
         raise ModelError(
-            f"per_chain of psf.Ranks must be 1 with correlation={settings.correlation!r}, got "
+            f"per_chain of comm must be 1 with correlation={settings.correlation!r}, got "
             f"{n_ranks}: correlated noise is carried by one rank"
         )
     filters = noisy_filters(model)
     if not filters:
         raise ModelError(
-            "per_chain of psf.Ranks must be 1 for a model without a StateSpace variable whose "
+            "per_chain of comm must be 1 for a model without a StateSpace variable whose "
             f"filter has particles, got {n_ranks}"
         )
     if panels := [name for name in filters if name in panel_variables(model)]:
         raise ModelError(
-            f"per_chain of psf.Ranks must be 1 for the panel {panels[0]!r}, got {n_ranks}: "
+            f"per_chain of comm must be 1 for the panel {panels[0]!r}, got {n_ranks}: "
             "every rank evaluates all records of its chains"
         )
     for filter in filters.values():

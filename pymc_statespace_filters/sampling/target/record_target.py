@@ -277,7 +277,7 @@ def target_of(
         return Target(model, None, settings, proposal_cov, group=group)
     if group is not None and group.size > 1:
         raise ModelError(
-            f"per_chain of psf.Ranks must be 1 for the panel {structure.name!r}, got "
+            f"per_chain of comm must be 1 for the panel {structure.name!r}, got "
             f"{group.size}: every rank evaluates all records of its chains"
         )
     return RecordTarget(model, settings, structure, proposal_cov, of_all=has_pilot)

@@ -2,8 +2,9 @@
 
 import math
 import numbers
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -16,7 +17,7 @@ ADAPTATIONS = ("chain", "continuous")
 
 @dataclass(frozen=True)
 class RandomWalkSettings:
-    """Settings of the random walk of `sample`, `sample_dram` and `run_models`: ``kernel=``.
+    """Settings of the random walk of `sample`, `sample_dram` and `run_models`.
 
     They are those of the step method `DRAM`, which describes the algorithm.
 
@@ -54,8 +55,7 @@ class RandomWalkSettings:
 
     Examples
     --------
-    >>> import pymc_statespace_filters as psf
-    >>> psf.RandomWalkSettings(stages=1).stages
+    >>> RandomWalkSettings.of({"stages": 1}).stages
     (1, 1)
     """
 
@@ -100,6 +100,18 @@ class RandomWalkSettings:
             cov = checked_proposal_cov(self.proposal_cov)
             object.__setattr__(self, "proposal_cov", tuple(map(tuple, cov.tolist())))
 
+    @classmethod
+    def of(cls, kernel: Mapping[str, Any] | Self | None) -> Self:
+        """The settings that a user gives as ``kernel=``; None is the default of each."""
+        if isinstance(kernel, cls):
+            return kernel
+        known = [field.name for field in fields(cls)]
+        if not isinstance(kernel, Mapping | None) or not set(kernel or ()) <= set(known):
+            raise ModelError(
+                f"kernel must be a mapping of some of {', '.join(known)}, or None, got {kernel!r}"
+            )
+        return cls(**(kernel or {}))
+
     def _check_correlation(self, correlation: float) -> None:
         if not _is_real(correlation) or not 0.0 < correlation < 1.0:
             raise ModelError(
@@ -119,16 +131,6 @@ class RandomWalkSettings:
                 f"screen must be a filter without noise {given}, got {self.screen!r}: its "
                 "estimates at the two points would not be compared at the same noise"
             )
-
-
-# What samplers once had as arguments of their own.
-FORMER_ARGUMENTS = {
-    field.name: f"give kernel=psf.RandomWalkSettings({field.name}=...)"
-    for field in fields(RandomWalkSettings)
-} | {
-    "ranks_per_chain": "give comm=psf.Ranks(per_chain=...)",
-    "gather": "give comm=psf.Ranks(gather=...)",
-}
 
 
 def checked_proposal_cov(proposal_cov: object, dim: int | None = None) -> np.ndarray:
