@@ -6,6 +6,7 @@ from .diagnostics import (
     leave_future_out,
 )
 from .evaluation.log_likelihood import log_likelihood
+from .evaluation.online import online
 from .evaluation.run_filter import run_filter
 from .evaluation.simulate import simulate
 from .evidence import (
@@ -117,6 +118,7 @@ __all__ = [
     "maximum_likelihood",
     "mechanics",
     "nearest_steps",
+    "online",
     "panel_from",
     "plot_average",
     "plot_drift",

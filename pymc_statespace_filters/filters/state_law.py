@@ -41,6 +41,23 @@ class StateLaw(NamedTuple):
         x[:, self.n_exact :] += _normal(columns[:, n:], n - self.n_exact, rng)
         return np.where(known[:, np.newaxis], x[:, self.order], np.nan)
 
+    def moments(self) -> tuple[Array, Array]:
+        """Mean (m, n) and covariance (m, n, n) at each point."""
+        n, n_exact = self.order.size, self.n_exact
+        highest = self.log_weights.max(axis=1, keepdims=True)
+        weights = np.exp(self.log_weights - highest)
+        weights /= weights.sum(axis=1, keepdims=True)
+        x = np.where(weights[:, None] > 0.0, self.parts[:, :n], 0.0)
+        mean = np.einsum("mk,mik->mi", weights, x)
+        apart = x - mean[:, :, None]
+        cov = np.einsum("mk,mik,mjk->mij", weights, apart, apart)
+        rows, columns = np.tril_indices(n - n_exact)
+        own = np.einsum("mk,mtk->mt", weights, self.parts[:, n:])
+        cov[:, n_exact + rows, n_exact + columns] += own
+        below = rows > columns
+        cov[:, n_exact + columns[below], n_exact + rows[below]] += own[:, below]
+        return mean[:, self.order], cov[:, self.order][:, :, self.order]
+
 
 def _normal(triangles: Array, n: int, rng: np.random.Generator) -> Array:
     """Normals (m, n) of mean zero, of covariances by their lower triangles, perhaps singular."""

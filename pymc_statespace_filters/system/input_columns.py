@@ -101,6 +101,22 @@ def _one_row_each(inputs: np.ndarray, n_rows: int) -> np.ndarray:
     return inputs
 
 
+def columns_between(
+    system: "StateSpaceModel", inputs: np.ndarray, first: int, axis: TimeAxis, resets: np.ndarray
+) -> np.ndarray:
+    """Rows of all columns for steps from ``first`` on, of the user's inputs (m, n_inputs).
+
+    ``axis`` has their starts and lengths, if they are not those of a grid; ``resets`` tells which
+    accumulators start anew with the first of them.
+    """
+    own: list[Any] = [axis.lengths, axis.starts] if axis.starts is not None else []
+    own += [_moves(first + np.arange(len(inputs)), every, axis) for every in system.held_for]
+    if system.accumulators:
+        is_first = np.arange(len(inputs)) == 0
+        own += [is_first * reset for reset in resets]
+    return np.column_stack([inputs, *own])
+
+
 def with_symbolic_columns(
     system: "StateSpaceModel", inputs: Any, steps: Any, axis: TimeAxis
 ) -> TensorVariable:

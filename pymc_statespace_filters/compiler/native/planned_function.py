@@ -122,8 +122,7 @@ class PlannedFunction:
         """Call from Python; arrays are contiguous and of the right types."""
         given = _arrays(values)  # alive until the call has ended
         words, made = self._prepared(given)
-        replacement = words[_REPLACEMENT]
-        run = PlanFunction(replacement) if replacement else self.plan.run
+        run = self._function_of(words)
         self._check(run(self.plan.address, *_vectors(words)))
         if self._tape is not None:
             made[self._tape] = made[self._tape][: words[_RESULTS + RESULTS.n_tape]]
@@ -139,6 +138,25 @@ class PlannedFunction:
         words, results = self._prepared(given, is_checked=True)
         places = [place if is_value else None for place, _, is_value in self._places]
         return BoundCall(self.plan.address, words, results, places, given)
+
+    def repeated(self, *values: Any) -> tuple[Callable[[], None], list[np.ndarray]]:
+        """A call from Python that reads the same arrays anew each time, and its results.
+
+        They are written anew by each call; numbers that are passed by value keep their values.
+        """
+        bound = self.bound(*values)
+        run, check, plan = self._function_of(bound.words), self._check, bound.plan
+        vectors = _vectors(bound.words)
+
+        def call(_memory: BoundCall = bound) -> None:
+            check(run(plan, *vectors))
+
+        return call, bound.results
+
+    def _function_of(self, words: array) -> Callable[..., int]:
+        """The function to call with these words, of which some name another one."""
+        replacement = words[_REPLACEMENT]
+        return PlanFunction(replacement) if replacement else self.plan.run
 
     def _prepared(
         self, given: Sequence[np.ndarray], *, is_checked: bool = False

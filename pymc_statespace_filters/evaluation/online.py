@@ -1,0 +1,364 @@
+"""`online`: a filter that takes the rows of a record as they come, without PyMC.
+
+At a single point the arguments and results of the machine code lie in memory that every row uses
+again, so that a row costs microseconds. Draws of a posterior are a mixture whose weights follow the
+likelihood of the rows.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ModelError
+from ..filters.checks import check_system_and_filter, tell_of_choice
+from ..filters.outcomes import NONE, Failure
+from ..filters.protocol import Filter, properties
+from ..system.checks import check_finite, check_random_seed, is_integer
+from ..system.input_columns import columns_between, resets_at
+from ..system.model import StateSpaceModel
+from ..system.parameters import flat_parameters
+from ..system.steps import GRID_TOLERANCE
+from ..system.time_axis import TimeAxis
+from .filter_steps import FilterSteps, InputRows, filter_steps
+
+Array = NDArray[np.float64]
+
+
+class Row(NamedTuple):
+    """What a row of observations tells.
+
+    Attributes
+    ----------
+    log_likelihood : float
+        log p(d_j | d_1 .. d_{j-1}); over draws, of their mixture.
+    mean : ndarray, shape (n,)
+        Of the state, given the rows so far.
+    cov : ndarray, shape (n, n)
+    n_effective : float
+        Effective number of draws of the parameters, 1 of a single point.
+    """
+
+    log_likelihood: float
+    mean: Array
+    cov: Array
+    n_effective: float
+
+
+class Prediction(NamedTuple):
+    """Mean (n,) and covariance (n, n) of the state at a later step, given the rows so far."""
+
+    mean: Array
+    cov: Array
+
+
+@dataclass(frozen=True)
+class OnlineState:
+    """Where an online filter stands: a value that pickles, and from which another one goes on."""
+
+    identity: tuple[str, str]  # of the system and the filter
+    theta: Array
+    seeds: NDArray[np.int64]
+    log_weights: Array
+    left: list[Array]  # by the filter at each point; of length 0 before the first row
+    step: int
+    time: float
+    t0: float
+    resets: Array
+    is_at_any_times: bool
+
+
+class OnlineFilter:
+    """A filter that takes rows as they come, see `online`."""
+
+    def __init__(self, system: StateSpaceModel, filter: Filter, state: OnlineState) -> None:
+        self._system, self._filter, self._start = system, filter, state
+        self._theta, self._seeds = state.theta, state.seeds
+        self._log_weights, self._resets = state.log_weights, state.resets
+        self._step, self._time, self._t0 = state.step, state.time, state.t0
+        self._placed = system.at_any_times if state.is_at_any_times else system
+        self._points = self._points_from(state.left)
+
+    def _points_from(self, left: list[Array]) -> FilterSteps:
+        given = self._placed, self._filter, self._theta, self._seeds, self._t0
+        return filter_steps(*given, left)
+
+    @property
+    def state(self) -> OnlineState:
+        """Where the filter stands, to be given to `online` elsewhere or later."""
+        return OnlineState(
+            self._start.identity, self._theta, self._seeds, self._log_weights, self._points.left,
+            self._step, self._time, self._t0, self._resets, self._placed is not self._system,
+        )  # fmt: skip
+
+    def update(
+        self,
+        observed: Any,
+        *,
+        step: int | None = None,
+        time: float | None = None,
+        inputs: Any = None,
+    ) -> Row:
+        """Take a row of observations.
+
+        Parameters
+        ----------
+        observed : float or array_like, shape (p,)
+            NaN marks a missing component.
+        step : int
+            The row's step, later than that of the row before. Or give `time`.
+        time : float
+            The row's time. Off the grid ``t0 + k * dt`` the gap is divided into the fewest equal
+            steps of at most ``dt``, as by `log_likelihood`.
+        inputs : array_like, optional
+            A row for each step since the last row of observations, or one for all of them; one more
+            if the observation has the argument u.
+
+        Returns
+        -------
+        Row
+
+        Raises
+        ------
+        ModelError
+            If the row is not later than the last one, has no number, or has a density of zero. The
+            filter then stands where it was.
+        """
+        datum = self._checked(observed)
+        place = self._place(step, time)
+        terms, codes, mean, cov = self._points(place.step, datum, self._rows(place, inputs))
+        if len(codes) == 1 and codes[0] == NONE:
+            self._points.keep()
+            row = Row(float(terms[0]), mean[0], cov[0], 1.0)
+        else:
+            row = self._mixed(place, terms, codes, mean, cov)
+        self._step, self._time = place.step, place.time
+        if self._placed.accumulators:
+            self._resets = resets_at(self._placed, datum)
+        return row
+
+    def _mixed(self, place: "_Place", terms: Array, codes: Array, mean: Array, cov: Array) -> Row:
+        """The row of several draws, of which those that fail are left out from now on."""
+        is_alive = codes == NONE
+        if not is_alive.any():
+            raise _failed(f"the row at step {place.step} has no likelihood", codes)
+        self._points.keep(None if is_alive.all() else is_alive)
+        self._theta, self._seeds = self._theta[is_alive], self._seeds[is_alive]
+        log_weights = self._log_weights[is_alive] + terms[is_alive]
+        log_likelihood = float(np.logaddexp.reduce(log_weights))
+        self._log_weights = log_weights - log_likelihood
+        weights = np.exp(self._log_weights)
+        moments = _mixture(weights, mean[is_alive], cov[is_alive])
+        return Row(log_likelihood, *moments, float(1.0 / np.square(weights).sum()))
+
+    def predict(
+        self, *, step: int | None = None, time: float | None = None, inputs: Any = None
+    ) -> Prediction:
+        """The state at a later step or time, given the rows so far; arguments as of `update`."""
+        place, missing = self._place(step, time), np.full(self._placed.p, np.nan)
+        _, codes, mean, cov = self._points(place.step, missing, self._rows(place, inputs))
+        is_alive = codes == NONE
+        if not is_alive.any():
+            raise _failed(f"there is no prediction at step {place.step}", codes)
+        weights = np.exp(self._log_weights[is_alive])
+        return Prediction(*_mixture(weights / weights.sum(), mean[is_alive], cov[is_alive]))
+
+    def _checked(self, observed: Any) -> Array:
+        datum = np.asarray(observed, dtype=np.float64).reshape(-1)
+        if datum.size != self._system.p:
+            raise ModelError(
+                f"observed must have a number for each of {list(self._system.observables)}, got "
+                f"{observed!r}"
+            )
+        numbers = datum.tolist()
+        if any(map(math.isinf, numbers)):
+            raise ModelError(f"observed must be finite, or NaN where it is missing, got {numbers}")
+        if all(map(math.isnan, numbers)):
+            raise ModelError(
+                "observed has no number: a row that is wholly missing is not given; predict gives "
+                "the state at its time"
+            )
+        return datum
+
+    def _place(self, step: int | None, time: float | None) -> "_Place":
+        """The step and time of a row, and the length of the steps that lead there."""
+        if (step is None) == (time is None):
+            raise ModelError("give exactly one of step and time")
+        dt, last = self._system.dt, self._step
+        is_on_grid = self._placed is self._system
+        if step is not None:
+            if not is_on_grid:
+                raise ModelError("step must be None: the rows so far have times off the grid")
+            if not is_integer(step) or step <= last:
+                raise _not_later("step", step, last)
+            return _Place(int(step), self._t0 + int(step) * dt, dt)
+        time = check_finite("time", time)
+        if time < self._time or (time == self._time and last >= 0):
+            raise _not_later("time", time, self._time)
+        number = (time - self._t0) / dt
+        if is_on_grid and abs(number - round(number)) <= GRID_TOLERANCE:
+            if round(number) <= last:
+                raise _not_later("time", time, self._time)
+            return _Place(round(number), time, dt)
+        if is_on_grid:
+            self._leave_grid(time)
+        gap = time - self._time
+        n_steps = max(math.ceil(gap / dt - GRID_TOLERANCE), 1) if gap > 0.0 else 0
+        return _Place(max(last, 0) + n_steps, time, gap / max(n_steps, 1))
+
+    def _leave_grid(self, time: float) -> None:
+        """Give steps lengths of their own from now on."""
+        if (reason := self._system.why_one_length) is not None:
+            raise ModelError(
+                f"time must be t0 + k * {self._system.dt:g}, as {reason}, got {time}: choose a dt "
+                "of which all times are multiples"
+            )
+        self._placed = self._system.at_any_times
+        self._points = self._points_from(self._points.left)
+
+    def _rows(self, place: "_Place", inputs: Any) -> InputRows | None:
+        """The rows of inputs of the steps since the last row, of all columns; None without any."""
+        system, first = self._placed, max(self._step, 0)
+        if not system.n_input_columns and inputs is None:
+            return None
+        n_steps = place.step - first
+        needed = n_steps + int(system.observation_uses_inputs)
+        own = inputs_of_steps(system, inputs, needed)
+        starts = lengths = None
+        if system is not self._system:
+            own = np.concatenate([own, own[-1:]] if len(own) == n_steps > 0 else [own])
+            own = own if len(own) else np.zeros((1, system.n_inputs))
+            starts = self._time + np.arange(len(own)) * place.length
+            lengths = np.append(np.full(len(own) - 1, place.length), 0.0)
+        axis = TimeAxis(np.array([place.step]), self._t0, system.dt, starts, lengths)
+        return InputRows(first, columns_between(system, own, first, axis, self._resets))
+
+
+class _Place(NamedTuple):
+    """A row's step and time, and the length of the steps that lead there."""
+
+    step: int
+    time: float
+    length: float
+
+
+def online(
+    system: StateSpaceModel,
+    filter: Filter,
+    params: Mapping[str, Any],
+    *,
+    state: OnlineState | None = None,
+    t0: float = 0.0,
+    random_seed: int | np.random.Generator | None = None,
+) -> OnlineFilter:
+    """Make a filter that takes the rows of a record as they come.
+
+    Parameters
+    ----------
+    system : StateSpaceModel
+    filter : a filter of the package, or a user's own that goes on from its state
+    params : mapping
+        Parameter values by name; or draws of them, arrays with a first dimension of length M (a
+        declared parameter's own shape comes last). Draws are a mixture with equal weights at the
+        start, which follow the likelihood of the rows.
+    state : OnlineState, optional
+        The ``state`` of another online filter of this system, filter and parameters, to go on from.
+    t0 : float
+        The time of step 0, where ``initial_mean`` and ``initial_cov`` hold.
+    random_seed : int or numpy.random.Generator, optional
+        Of the noise inside the filter.
+
+    Returns
+    -------
+    OnlineFilter
+        ``update(observed, step= | time=, inputs=None)`` gives a `Row`, ``predict(step= | time=,
+        inputs=None)`` a `Prediction`; ``state`` pickles.
+
+    Raises
+    ------
+    ModelError
+        If the filter cannot treat the system or cannot go on from a state, parameters do not fit,
+        or the state is of another system, filter or parameters.
+
+    Examples
+    --------
+    >>> import pymc_statespace_filters as psf
+    >>> system = psf.StateSpaceModel(
+    ...     transition=psf.EulerMaruyama(lambda x, k: [x[1], -k * x[0]], [[0.0], [0.3]], dt=0.1),
+    ...     observation=lambda x: [x[0]],
+    ...     observation_noise=[[0.01]],
+    ...     initial_mean=[1.0, 0.0],
+    ...     initial_cov=[[0.1, 0.0], [0.0, 0.1]],
+    ... )
+    >>> tracker = psf.online(system, psf.EKF(), {"k": 2.0})
+    >>> row = tracker.update(0.98, step=1)
+    >>> row.mean.shape, row.cov.shape
+    ((2,), (2, 2))
+    >>> later = psf.online(system, psf.EKF(), {"k": 2.0}, state=tracker.state)
+    >>> later.update(0.95, step=2) == tracker.update(0.95, step=2)  # doctest: +SKIP
+    """
+    check_system_and_filter(system, filter)
+    tell_of_choice(system, filter)
+    if not properties(filter).resumes:
+        raise ModelError(f"{type(filter).__name__} cannot go on from its state")
+    theta = np.atleast_2d(flat_parameters(system, params))
+    if theta.ndim != 2 or not len(theta):
+        raise ModelError(f"params must be numbers or draws along one dimension, got {theta.shape}")
+    identity = system.fingerprint, repr(filter)
+    if state is not None:
+        if not isinstance(state, OnlineState):
+            raise ModelError(f"state must be that of an online filter, got {type(state).__name__}")
+        if state.identity != identity:
+            raise ModelError("state must be of the same system and filter, got one of another")
+        if not np.isin(state.theta, theta).all():
+            raise ModelError("state must be of the same parameters, got one of others")
+        return OnlineFilter(system, filter, state)
+    rng = check_random_seed(random_seed)
+    seeds = rng.integers(np.iinfo(np.int64).max, size=len(theta))
+    weights = np.full(len(theta), -math.log(len(theta)))
+    t0, resets = check_finite("t0", t0), np.zeros(len(system.accumulators))
+    nothing = [np.empty(0)] * len(theta)
+    start = OnlineState(identity, theta, seeds, weights, nothing, -1, t0, t0, resets, False)
+    return OnlineFilter(system, filter, start)
+
+
+def _mixture(weights: Array, mean: Array, cov: Array) -> tuple[Array, Array]:
+    """Mean and covariance of a mixture of laws with these means (m, n) and covariances."""
+    whole = weights @ mean
+    apart = mean - whole
+    return whole, np.einsum("m,mij->ij", weights, cov) + (apart.T * weights) @ apart
+
+
+def inputs_of_steps(system: StateSpaceModel, inputs: Any, needed: int) -> Array:
+    """Inputs (needed, n_inputs): a row for each step, or one for all."""
+    if not system.n_inputs and inputs is not None:
+        raise ModelError("inputs must be None for a system without inputs")
+    if needed == 0 or not system.n_inputs:
+        return np.zeros((needed, system.n_inputs))
+    if inputs is None:
+        raise ModelError(f"inputs must have values of {list(system.inputs)}, got None")
+    rows = np.asarray(inputs, dtype=np.float64)
+    if rows.ndim < 2:
+        rows = rows.reshape(-1, 1) if system.n_inputs == 1 else rows.reshape(1, -1)
+    if rows.ndim != 2 or rows.shape[1] != system.n_inputs or len(rows) not in (1, needed):
+        raise ModelError(
+            f"inputs must have shape {(needed, system.n_inputs)}, a row for each step since the "
+            f"last row of observations, or one row for all, got {np.shape(inputs)}"
+        )
+    if not np.isfinite(rows).all():
+        raise ModelError("inputs must be finite")
+    return np.broadcast_to(rows, (needed, system.n_inputs))
+
+
+def _not_later(name: str, value: Any, last: Any) -> ModelError:
+    if name == "step" and (last < 0 or not is_integer(value)):
+        return ModelError(f"step must be an integer from 0 on, got {value!r}")
+    return ModelError(f"{name} must be later than the last one, {last}, got {value!r}")
+
+
+def _failed(what: str, codes: Array) -> ModelError:
+    failure = Failure.of(int(codes[0]))
+    return ModelError(". ".join([f"{what}: {failure.message}", *filter(None, [failure.cure])]))
