@@ -58,6 +58,7 @@ GROUPS = {
         "simulate",
         "log_likelihood",
         "run_filter",
+        "online",
     ),
     "In a PyMC model": (
         "StateSpace",

@@ -17,13 +17,11 @@ from ..errors import ModelError
 from ..filters.checks import check_system_and_filter, tell_of_choice
 from ..filters.outcomes import NONE, Failure
 from ..filters.protocol import Filter, properties
-from ..system.checks import check_finite, check_random_seed, is_integer
-from ..system.input_columns import columns_between, resets_at
+from ..system.checks import check_finite, check_random_seed
 from ..system.model import StateSpaceModel
 from ..system.parameters import flat_parameters
-from ..system.steps import GRID_TOLERANCE
-from ..system.time_axis import TimeAxis
-from .filter_steps import FilterSteps, InputRows, filter_steps
+from .filter_steps import FilterSteps, Step, filter_steps
+from .row_steps import Place, RowSteps
 
 Array = NDArray[np.float64]
 
@@ -68,7 +66,7 @@ class OnlineState:
     time: float
     t0: float
     resets: Array
-    is_at_any_times: bool
+    is_on_grid: bool
 
 
 class OnlineFilter:
@@ -76,14 +74,13 @@ class OnlineFilter:
 
     def __init__(self, system: StateSpaceModel, filter: Filter, state: OnlineState) -> None:
         self._system, self._filter, self._start = system, filter, state
-        self._theta, self._seeds = state.theta, state.seeds
-        self._log_weights, self._resets = state.log_weights, state.resets
-        self._step, self._time, self._t0 = state.step, state.time, state.t0
-        self._placed = system.at_any_times if state.is_at_any_times else system
+        self._theta, self._seeds, self._log_weights = state.theta, state.seeds, state.log_weights
+        at, is_on_grid = (state.t0, state.step, state.time, state.resets), state.is_on_grid
+        self._steps = RowSteps(system, *at, is_on_grid=is_on_grid)
         self._points = self._points_from(state.left)
 
     def _points_from(self, left: list[Array]) -> FilterSteps:
-        given = self._placed, self._filter, self._theta, self._seeds, self._t0
+        given = self._steps.system, self._filter, self._theta, self._seeds, self._start.t0
         return filter_steps(*given, left)
 
     @property
@@ -91,7 +88,8 @@ class OnlineFilter:
         """Where the filter stands, to be given to `online` elsewhere or later."""
         return OnlineState(
             self._start.identity, self._theta, self._seeds, self._log_weights, self._points.left,
-            self._step, self._time, self._t0, self._resets, self._placed is not self._system,
+            self._steps.step, self._steps.time, self._start.t0, self._steps.resets,
+            self._steps.is_on_grid,
         )  # fmt: skip
 
     def update(
@@ -128,19 +126,27 @@ class OnlineFilter:
             filter then stands where it was.
         """
         datum = self._checked(observed)
-        place = self._place(step, time)
-        terms, codes, mean, cov = self._points(place.step, datum, self._rows(place, inputs))
+        place, found = self._evaluated(datum, step, time, inputs)
+        terms, codes, mean, cov = found
         if len(codes) == 1 and codes[0] == NONE:
             self._points.keep()
             row = Row(float(terms[0]), mean[0], cov[0], 1.0)
         else:
             row = self._mixed(place, terms, codes, mean, cov)
-        self._step, self._time = place.step, place.time
-        if self._placed.accumulators:
-            self._resets = resets_at(self._placed, datum)
+        self._steps.passed(place, datum)
         return row
 
-    def _mixed(self, place: "_Place", terms: Array, codes: Array, mean: Array, cov: Array) -> Row:
+    def _evaluated(
+        self, datum: Array, step: int | None, time: float | None, inputs: Any
+    ) -> tuple[Place, Step]:
+        """A row at all points, from where the filter stands."""
+        system = self._steps.system
+        place = self._steps.place(step, time)
+        if self._steps.system is not system:  # which has left the grid
+            self._points = self._points_from(self._points.left)
+        return place, self._points(place.step, datum, self._steps.rows(place, inputs))
+
+    def _mixed(self, place: Place, terms: Array, codes: Array, mean: Array, cov: Array) -> Row:
         """The row of several draws, of which those that fail are left out from now on."""
         is_alive = codes == NONE
         if not is_alive.any():
@@ -158,8 +164,8 @@ class OnlineFilter:
         self, *, step: int | None = None, time: float | None = None, inputs: Any = None
     ) -> Prediction:
         """The state at a later step or time, given the rows so far; arguments as of `update`."""
-        place, missing = self._place(step, time), np.full(self._placed.p, np.nan)
-        _, codes, mean, cov = self._points(place.step, missing, self._rows(place, inputs))
+        place, found = self._evaluated(np.full(self._system.p, np.nan), step, time, inputs)
+        _, codes, mean, cov = found
         is_alive = codes == NONE
         if not is_alive.any():
             raise _failed(f"there is no prediction at step {place.step}", codes)
@@ -182,67 +188,6 @@ class OnlineFilter:
                 "the state at its time"
             )
         return datum
-
-    def _place(self, step: int | None, time: float | None) -> "_Place":
-        """The step and time of a row, and the length of the steps that lead there."""
-        if (step is None) == (time is None):
-            raise ModelError("give exactly one of step and time")
-        dt, last = self._system.dt, self._step
-        is_on_grid = self._placed is self._system
-        if step is not None:
-            if not is_on_grid:
-                raise ModelError("step must be None: the rows so far have times off the grid")
-            if not is_integer(step) or step <= last:
-                raise _not_later("step", step, last)
-            return _Place(int(step), self._t0 + int(step) * dt, dt)
-        time = check_finite("time", time)
-        if time < self._time or (time == self._time and last >= 0):
-            raise _not_later("time", time, self._time)
-        number = (time - self._t0) / dt
-        if is_on_grid and abs(number - round(number)) <= GRID_TOLERANCE:
-            if round(number) <= last:
-                raise _not_later("time", time, self._time)
-            return _Place(round(number), time, dt)
-        if is_on_grid:
-            self._leave_grid(time)
-        gap = time - self._time
-        n_steps = max(math.ceil(gap / dt - GRID_TOLERANCE), 1) if gap > 0.0 else 0
-        return _Place(max(last, 0) + n_steps, time, gap / max(n_steps, 1))
-
-    def _leave_grid(self, time: float) -> None:
-        """Give steps lengths of their own from now on."""
-        if (reason := self._system.why_one_length) is not None:
-            raise ModelError(
-                f"time must be t0 + k * {self._system.dt:g}, as {reason}, got {time}: choose a dt "
-                "of which all times are multiples"
-            )
-        self._placed = self._system.at_any_times
-        self._points = self._points_from(self._points.left)
-
-    def _rows(self, place: "_Place", inputs: Any) -> InputRows | None:
-        """The rows of inputs of the steps since the last row, of all columns; None without any."""
-        system, first = self._placed, max(self._step, 0)
-        if not system.n_input_columns and inputs is None:
-            return None
-        n_steps = place.step - first
-        needed = n_steps + int(system.observation_uses_inputs)
-        own = inputs_of_steps(system, inputs, needed)
-        starts = lengths = None
-        if system is not self._system:
-            own = np.concatenate([own, own[-1:]] if len(own) == n_steps > 0 else [own])
-            own = own if len(own) else np.zeros((1, system.n_inputs))
-            starts = self._time + np.arange(len(own)) * place.length
-            lengths = np.append(np.full(len(own) - 1, place.length), 0.0)
-        axis = TimeAxis(np.array([place.step]), self._t0, system.dt, starts, lengths)
-        return InputRows(first, columns_between(system, own, first, axis, self._resets))
-
-
-class _Place(NamedTuple):
-    """A row's step and time, and the length of the steps that lead there."""
-
-    step: int
-    time: float
-    length: float
 
 
 def online(
@@ -321,7 +266,7 @@ def online(
     weights = np.full(len(theta), -math.log(len(theta)))
     t0, resets = check_finite("t0", t0), np.zeros(len(system.accumulators))
     nothing = [np.empty(0)] * len(theta)
-    start = OnlineState(identity, theta, seeds, weights, nothing, -1, t0, t0, resets, False)
+    start = OnlineState(identity, theta, seeds, weights, nothing, -1, t0, t0, resets, True)
     return OnlineFilter(system, filter, start)
 
 
@@ -330,33 +275,6 @@ def _mixture(weights: Array, mean: Array, cov: Array) -> tuple[Array, Array]:
     whole = weights @ mean
     apart = mean - whole
     return whole, np.einsum("m,mij->ij", weights, cov) + (apart.T * weights) @ apart
-
-
-def inputs_of_steps(system: StateSpaceModel, inputs: Any, needed: int) -> Array:
-    """Inputs (needed, n_inputs): a row for each step, or one for all."""
-    if not system.n_inputs and inputs is not None:
-        raise ModelError("inputs must be None for a system without inputs")
-    if needed == 0 or not system.n_inputs:
-        return np.zeros((needed, system.n_inputs))
-    if inputs is None:
-        raise ModelError(f"inputs must have values of {list(system.inputs)}, got None")
-    rows = np.asarray(inputs, dtype=np.float64)
-    if rows.ndim < 2:
-        rows = rows.reshape(-1, 1) if system.n_inputs == 1 else rows.reshape(1, -1)
-    if rows.ndim != 2 or rows.shape[1] != system.n_inputs or len(rows) not in (1, needed):
-        raise ModelError(
-            f"inputs must have shape {(needed, system.n_inputs)}, a row for each step since the "
-            f"last row of observations, or one row for all, got {np.shape(inputs)}"
-        )
-    if not np.isfinite(rows).all():
-        raise ModelError("inputs must be finite")
-    return np.broadcast_to(rows, (needed, system.n_inputs))
-
-
-def _not_later(name: str, value: Any, last: Any) -> ModelError:
-    if name == "step" and (last < 0 or not is_integer(value)):
-        return ModelError(f"step must be an integer from 0 on, got {value!r}")
-    return ModelError(f"{name} must be later than the last one, {last}, got {value!r}")
 
 
 def _failed(what: str, codes: Array) -> ModelError:
