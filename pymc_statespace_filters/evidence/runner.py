@@ -223,9 +223,8 @@ def _check_guided(
         return
     if refused := [one.name for one in estimators if not isinstance(one, Importance)]:
         raise ModelError(
-            "estimators must be 'importance' with filter= or draws of sample_smc, which only say "
-            f"where the posterior lies, got {refused}, for which the draws must be those of chains "
-            "at this posterior"
+            "with filter=, and of sample_smc, the draws say where the posterior lies and are not "
+            f"averaged: use estimate_evidence with estimators='importance', got {refused}"
         )
 
 

@@ -121,7 +121,7 @@ class TestModel:
         assert abs(found.log_evidence - (-4.6154)) < 4 * found.se < 0.2
 
     def test_no_other_takes_them(self, model):
-        idata, message = self.idata(8), r"must be 'importance' .* sample_smc, .*, got \['{}'\]"
+        idata, message = self.idata(8), r"of sample_smc, .* estimators='importance', got \['{}'\]"
         with pytest.raises(ModelError, match=message.format("bridge")):
             estimation.estimate_evidence(idata, model, estimators=["importance", "bridge"])
         with pytest.raises(ModelError, match=message.format("chib_jeliazkov")):

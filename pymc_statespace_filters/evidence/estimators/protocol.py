@@ -42,7 +42,7 @@ class Estimator(Protocol):
     Any object with these three members can be passed to `estimate_evidence`. Its own settings are
     its attributes, checked when it is constructed; it raises `ModelError` for a model that it
     cannot treat. A frozen dataclass with a field ``target_se`` that is None gets that of
-    `estimate_evidence`.
+    `estimate_evidence`. It is given draws of chains at the posterior itself.
 
     Examples
     --------
