@@ -215,7 +215,7 @@ def test_slow_evaluations_have_a_progress_bar(regression_model, monkeypatch):
         def advance(self, task, advance):
             self.done += advance
 
-    monkeypatch.setattr(progress, "create_simple_progress", Bar)
+    monkeypatch.setattr("pymc.progress_bar.create_simple_progress", Bar)
     for patience, wanted in ((60.0, True), (0.0, False), (0.0, True)):
         monkeypatch.setattr(progress, "PATIENCE", patience)
         idata = exact_draws((2, 200))

@@ -98,7 +98,7 @@ class Screen:
 @pytest.fixture
 def screen(monkeypatch):
     screen = Screen()
-    monkeypatch.setattr(progress, "create_simple_progress", screen)
+    monkeypatch.setattr("pymc.progress_bar.create_simple_progress", screen)
     return screen
 
 
