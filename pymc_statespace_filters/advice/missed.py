@@ -8,7 +8,7 @@ from ..pymc_model.posterior_draws import noise_was_moved, unconstrained_draws
 from ..sampling.output.facts import EndedRun
 from ..unvisited.check import MOST_PARAMETERS
 from ..unvisited.sentences import store, unvisited
-from .signs import signs_message
+from .signs import signs_message, with_both_signs
 from .step_check import step_problems
 
 # CPU seconds: so many, or this share of the time of the run if that is more.
@@ -32,9 +32,6 @@ def _missed_parts(fact: EndedRun) -> list[str]:
     The outcome is stored with the draws. Chains that held one noise seed are not checked.
     """
     tree, model, prior = fact.tree, fact.model, fact.target.prior_draws
-    posterior = tree["posterior"]
-    if posterior.sizes["chain"] * posterior.sizes["draw"] < _LEAST_DRAWS:
-        return []
     stats = tree["sample_stats"]
     seeded = [name for name in stats.data_vars if str(name).endswith("_seed")]
     if "lp" not in stats or (seeded and not tree.attrs["refresh_noise"]):
@@ -42,19 +39,24 @@ def _missed_parts(fact: EndedRun) -> list[str]:
     draws = unconstrained_draws(tree, model)
     if draws.shape[-1] > MOST_PARAMETERS:
         return []
+    flat = draws.reshape(-1, draws.shape[-1])
+    is_enough = len(flat) >= _LEAST_DRAWS
+    if not (is_enough or with_both_signs(model, flat)):
+        return []
     density = ModelDensity(model, moved=noise_was_moved(tree))
 
     def evaluate(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         size = len(x), len(density.seed_names)
         return density.evaluate(x, rng.integers(np.iinfo(np.int64).max, size=size))
 
-    log_density = stats["lp"].transpose("chain", "draw").values.astype(np.float64)
-    seconds = max(_LEAST_SECONDS, _SHARE * fact.seconds)
-    wide = prior.draws if prior.is_prior and len(prior.draws) > 1 else None
-    found = unvisited(model, draws, log_density, evaluate, seconds, fact.rngs[0], wide)
-    store(tree, found)
+    found: list[str] = []
+    if is_enough:
+        log_density = stats["lp"].transpose("chain", "draw").values.astype(np.float64)
+        seconds = max(_LEAST_SECONDS, _SHARE * fact.seconds)
+        wide = prior.draws if prior.is_prior and len(prior.draws) > 1 else None
+        found = unvisited(model, draws, log_density, evaluate, seconds, fact.rngs[0], wide)
+        store(tree, found)
     if not density.seed_names:
-        flat = draws.reshape(-1, draws.shape[-1])
         sign = signs_message(model, flat, lambda x: evaluate(x, fact.rngs[0]))
         found = found if sign is None else [sign, *found]
     return [f"{text[0].upper()}{text[1:]}." for text in found]

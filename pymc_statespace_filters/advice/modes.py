@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pymc.model import Model
 
-from ..pymc_model.density import ConstrainedValues
+from ..pymc_model.density import ConstrainedValues, ModelDensity
 from ..sampling.output.facts import SeparateModes
 from ..sampling.starts.modes import is_reordered
 from ..sampling.target.variables import RaveledVariables
 from ..unvisited import ALL_MODES
+from .signs import is_symmetric, with_both_signs
 from .words import sentences
 
 _LEAST_SHARE = 0.02  # of the points; fewer have only not moved yet
@@ -37,6 +38,8 @@ def _(fact: SeparateModes) -> list[str]:
     if len(large) < 2:
         return []
     members = [np.flatnonzero(points.mode == numbers[i]) for i in large]
+    if fact.before_run and _are_mirrored(model, [points.x[of_mode] for of_mode in members]):
+        return []
     highest = [of_mode[points.log_density[of_mode].argmax()] for of_mode in members]
     names = _differing(model, raveled, [points.x[of_mode] for of_mode in members])
     at = ConstrainedValues(model)
@@ -52,6 +55,26 @@ def _(fact: SeparateModes) -> list[str]:
         f"The posterior has {len(large)} separate modes: {' and '.join(described)}. A mean over "
         f"all modes may lie in none of them.{advice}"
     ]
+
+
+def _are_mirrored(model: Model, modes: Sequence[Array]) -> bool:
+    """Whether the modes are one, at both signs of scales whose sign has no meaning."""
+    x = np.concatenate(modes)
+    candidates = with_both_signs(model, x)
+    density = ModelDensity(model) if candidates else None
+    if density is None or density.seed_names:
+        return False
+
+    def evaluate(at: Array) -> Array:
+        return density.evaluate(at, np.zeros((len(at), 0), dtype=np.int64))
+
+    folded = [mode.copy() for mode in modes]
+    for i in candidates:
+        if is_symmetric(x, i, evaluate):
+            for mode in folded:
+                mode[:, i] = abs(mode[:, i])
+    means, sds = (np.array([f(mode, axis=0) for mode in folded]) for f in (np.mean, np.std))
+    return bool((np.ptp(means, axis=0) <= _APART * sds.max(axis=0)).all())
 
 
 def _are_orders(modes: Sequence[Sequence[Mapping[str, Array]]]) -> bool:

@@ -22,20 +22,35 @@ def signs_message(model: Model, draws: Array, evaluate: Callable[[Array], Array]
     Only variables without a transform that a StateSpace variable depends on: others may well be
     symmetric.
     """
-    parameters = [node.inputs[-5] for node in state_space_nodes(model).values()]
-    free = [rv for rv, transform in model.rvs_to_transforms.items() if transform is None]
-    used = {rv.name for rv in set(free) & set(ancestors(parameters))}
-    elements, negative = Elements.of(model), (draws < 0).mean(axis=0)
-    x = draws[np.linspace(0, len(draws) - 1, _N_POINTS).astype(int)]
-    for i, share in enumerate(negative):
-        if elements.variables[i] not in used or min(share, 1 - share) < _LEAST_SHARE:
-            continue
-        opposite = x * np.where(np.arange(x.shape[1]) == i, -1.0, 1.0)
-        if np.allclose(evaluate(x), evaluate(opposite), rtol=1e-9, atol=0.0):
-            name = elements.labels[i]
+    for i in with_both_signs(model, draws):
+        if is_symmetric(draws, i, evaluate):
+            name = Elements.of(model).labels[i]
+            share = (draws[:, i] < 0).mean()
             return (
                 f"the density is the same at {name} and -{name}, and {share:.0%} of the draws are "
                 f"negative, so that the mean and the intervals of {name} say nothing of its size. "
                 f"If {name} is a scale, give it a positive prior, such as pm.HalfNormal"
             )
     return None
+
+
+def with_both_signs(model: Model, draws: Array) -> list[int]:
+    """The elements of draws (n, k) that may be scales, of which some draws are negative."""
+    parameters = [node.inputs[-5] for node in state_space_nodes(model).values()]
+    free = [rv for rv, transform in model.rvs_to_transforms.items() if transform is None]
+    used = {rv.name for rv in set(free) & set(ancestors(parameters))}
+    negative = (draws < 0).mean(axis=0)
+    is_both = np.minimum(negative, 1 - negative) >= _LEAST_SHARE
+    variables = Elements.of(model).variables
+    return [i for i, both in enumerate(is_both) if both and variables[i] in used]
+
+
+def is_symmetric(draws: Array, i: int, evaluate: Callable[[Array], Array]) -> bool:
+    """Whether the density is the same at the opposite sign of an element."""
+    x = draws[np.linspace(0, len(draws) - 1, _N_POINTS).astype(int)]
+    return np.allclose(evaluate(x), evaluate(reflected(x, i)), rtol=1e-9, atol=0.0)
+
+
+def reflected(x: Array, i: int) -> Array:
+    """Points (n, k) with the opposite sign of an element."""
+    return x * np.where(np.arange(x.shape[1]) == i, -1.0, 1.0)

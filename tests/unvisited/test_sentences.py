@@ -9,6 +9,7 @@ import pytest
 import xarray as xr
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.advice import missed as end_of_run
 from pymc_statespace_filters.unvisited import sentences
 from pymc_statespace_filters.unvisited.sentences import store, stored, unvisited
 
@@ -86,7 +87,7 @@ def test_a_run_warns_and_keeps_what_it_has_found(sampler, monkeypatch, caplog):
         mu = pm.Normal("mu")
         pm.Normal("y", mu, 1.0, observed=[0.3, 0.1])
         right = psf.sample(1000, **call)
-        monkeypatch.setattr(sentences, "unvisited", found)
+        monkeypatch.setattr(end_of_run, "unvisited", found)
         with caplog.at_level(logging.DEBUG, logger="pymc.stats.convergence"):
             missed = psf.sample(1000, **call)
             few = psf.sample(400, **call)

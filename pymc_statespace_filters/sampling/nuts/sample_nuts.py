@@ -136,5 +136,5 @@ def _start(
         return lambda own: centre + own.uniform(-width, width)
     target.prepare()
     population = find_population(target, rng, progressbar=progressbar)
-    tell(SeparateModes(model, target.raveled, population), of_model(name))
+    tell(SeparateModes(model, target.raveled, population, before_run=True), of_model(name))
     return lambda own: population.x[own.integers(len(population.x))]

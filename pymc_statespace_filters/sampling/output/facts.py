@@ -35,11 +35,15 @@ class ChainFact(Fact):
 
 @dataclass(frozen=True)
 class SeparateModes(ChainFact):
-    """Points that the search for starts has found, perhaps in several modes."""
+    """Points that the search for starts has found, perhaps in several modes.
+
+    Before a run, whose end names parameters without a sign, or alone.
+    """
 
     model: Model
     raveled: RaveledVariables
     points: Points
+    before_run: bool = False
 
 
 @dataclass(frozen=True)

@@ -158,7 +158,7 @@ def search_population(
     except Exception as error:
         error.add_note(begin + "in the search for starts")
         raise
-    tell(SeparateModes(model, target.raveled, found), begin)
+    tell(SeparateModes(model, target.raveled, found, before_run=True), begin)
     level, noise = float(np.median(found.log_density)), []
     if checkpoint is not None:
         checkpoint.append(_STARTS, {"population": found.x}, {"level": np.array(level)})
