@@ -2,10 +2,14 @@
 
 from typing import NamedTuple
 
+from xarray import DataTree
+
 from ..errors import StateSpaceFiltersError
-from ..filter_checks.checks import check_at_end, doubts, store
+from ..evidence.facts import CorrectingFilter, FiltersOfDraws
+from ..filter_checks.checks import MORE_POINTS, check_at_end, doubts, store, stored
 from ..filter_checks.facts import FilterOutcomes, UsedFilters
 from ..filter_checks.finding import EXACT, OFF
+from ..parallel.shared_rows import by_first_rank
 from ..parallel.signals import unless_interrupted
 from ..pymc_model.inspection import observes_state_space
 from ..pymc_model.posterior_draws import MIN_DRAWS
@@ -30,6 +34,20 @@ class FilterCheck(NamedTuple):
 @sentences.register
 def _(fact: FilterOutcomes) -> list[str]:
     return doubts(fact.outcomes)
+
+
+@sentences.register
+def _(fact: FiltersOfDraws) -> list[str]:
+    return stored(fact.idata, fact.model, OFF)
+
+
+@sentences.register
+def _(fact: CorrectingFilter) -> list[str]:
+    given = fact.draws, fact.model, fact.filter, fact.seconds, fact.rng, MORE_POINTS
+    outcomes = by_first_rank(lambda: check_at_end(*given))
+    if isinstance(fact.draws, DataTree):
+        store(fact.draws, outcomes)
+    return doubts(outcomes)
 
 
 @told.register

@@ -2,19 +2,37 @@
 
 import numpy as np
 
+from ..evidence.facts import PartsOfPosterior
+from ..parallel.shared_rows import by_first_rank
 from ..parallel.signals import unless_interrupted
 from ..pymc_model.density import ModelDensity
-from ..pymc_model.posterior_draws import noise_was_moved, unconstrained_draws
+from ..pymc_model.posterior_draws import are_populations, noise_was_moved, unconstrained_draws
 from ..sampling.output.facts import EndedRun
 from ..unvisited.check import MOST_PARAMETERS
-from ..unvisited.sentences import store, unvisited
+from ..unvisited.sentences import store, stored, unvisited
 from .signs import signs_message, with_both_signs
 from .step_check import step_problems
+from .words import sentences
 
 # CPU seconds: so many, or this share of the time of the run if that is more.
 _LEAST_SECONDS, _SHARE = 1.0, 0.1
 # Fewer draws in all know too little of their tails.
 _LEAST_DRAWS = 4000
+
+
+@sentences.register
+def _(fact: PartsOfPosterior) -> list[str]:
+    """What was found at the end of the run, or is found now, of chains.
+
+    Populations fill their tails otherwise, and have a look of their own.
+    """
+    if (known := stored(fact.idata)) is not None:
+        return known
+    posterior = fact.posterior
+    if are_populations(fact.idata) or posterior.log_density.size < _LEAST_DRAWS:
+        return []
+    parts = posterior.draws, posterior.log_density, posterior.evaluate
+    return by_first_rank(lambda: unvisited(fact.model, *parts, _LEAST_SECONDS, fact.rng))
 
 
 def missed_of(fact: EndedRun) -> list[str]:

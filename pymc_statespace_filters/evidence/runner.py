@@ -14,19 +14,15 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..errors import INSIDE, EvidenceWarning, ModelError
-from ..filter_checks.checks import MORE_POINTS, check_at_end, doubts
-from ..filter_checks.checks import stored as stored_filter_checks
-from ..filter_checks.finding import OFF
+from ..facts import sentences
 from ..filters.protocol import Filter
 from ..filters.written import short_form
-from ..parallel.shared_rows import by_first_rank
 from ..progress import row_progress
 from ..pymc_model.density import ModelDensity
 from ..pymc_model.inspection import exactness
 from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.posterior_draws import are_populations, noise_was_moved, posterior_group
 from ..pymc_model.prior import Support
-from ..unvisited.sentences import stored, unvisited
 from .agreement import chosen_estimator
 from .checks import check_convergence, check_discretisation
 from .estimators.importance import Importance
@@ -35,6 +31,7 @@ from .estimators.protocol import Estimate, Estimator
 from .evidence import Evidence, store_evidence
 from .exact_density import ExactDensity
 from .exchangeable_labels import exchangeable_labels, uncounted_orders
+from .facts import CorrectingFilter, FiltersOfDraws, PartsOfPosterior
 from .observed_data import data_fingerprint, observation_count
 from .posterior import Posterior
 from .posterior_of_draws import build_posterior
@@ -47,8 +44,6 @@ SHARED = "shared proposals"
 UNVISITED = "unvisited tails"
 LABELS = "exchangeable labels"
 FILTER = "check of the filter"
-# CPU seconds for the search for tails that the chains have missed; fewest draws that it needs.
-CHECK_SECONDS, LEAST_DRAWS = 1.0, 4000
 LESS_CERTAIN = "{} is less certain than its standard error suggests"
 
 
@@ -96,10 +91,10 @@ def run_estimators(
     common = (
         *support.check(),
         *check_discretisation(model, idata, posterior.draws),
-        *(stored_filter_checks(idata, model, OFF) if exact is None else ()),
+        *(sentences(FiltersOfDraws(idata, model)) if exact is None else ()),
         *check_convergence(posterior, idata),
         *uncounted_orders(model, labels),
-        *_missed(idata, model, posterior, stream(UNVISITED)),
+        *sentences(PartsOfPosterior(idata, model, posterior, stream(UNVISITED))),
     )
     posterior = replace(posterior, shared_seed=(*entropy, crc32(SHARED.encode())))
     if are_populations(idata):
@@ -109,7 +104,9 @@ def run_estimators(
             noise = "refreshed" if exact.n_noisy else "none"
             posterior = exact_posterior(posterior, exact, stream(CORRECTION), announce)
             seconds = time.process_time() - began
-            off = _doubts_of_filter(exact, posterior, seconds, stream(FILTER))
+            draws = posterior.draws.reshape(-1, posterior.draws.shape[-1])
+            given = draws, model, exact.filter, seconds, stream(FILTER)
+            off = sentences(CorrectingFilter(*given))
             common, remedy = (*common, *off), _remedy(exact.filter, is_off=bool(off))
             posterior = replace(posterior, remedy=remedy)
         estimates = _estimates(estimators, posterior, stream, announce)
@@ -135,30 +132,6 @@ def run_estimators(
     by_name = {one.name: one for one in estimators}
     _warn(*_problem(by_name[taken], estimates[taken]))
     return found
-
-
-def _missed(
-    idata: xr.DataTree, model: pm.Model, posterior: Posterior, rng: np.random.Generator
-) -> list[str]:
-    """What the draws have missed, as was found at the end of their run or is found now.
-
-    Now only of chains: populations fill their tails otherwise, and have a look of their own.
-    """
-    if (known := stored(idata)) is not None:
-        return known
-    if are_populations(idata) or posterior.log_density.size < LEAST_DRAWS:
-        return []
-    parts = posterior.draws, posterior.log_density, posterior.evaluate
-    return by_first_rank(lambda: unvisited(model, *parts, CHECK_SECONDS, rng))
-
-
-def _doubts_of_filter(
-    exact: ExactDensity, posterior: Posterior, seconds: float, rng: np.random.Generator
-) -> list[str]:
-    """What is wrong with the filter that replaces those of the model, at the corrected draws."""
-    draws = posterior.draws.reshape(-1, posterior.draws.shape[-1])
-    given = draws, exact.model, exact.filter, seconds, rng, MORE_POINTS
-    return doubts(by_first_rank(lambda: check_at_end(*given)))
 
 
 def _remedy(filter: Filter, *, is_off: bool) -> str:

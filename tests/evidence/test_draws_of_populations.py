@@ -9,13 +9,16 @@ import pytest
 import xarray as xr
 from scipy.stats import norm
 
+from pymc_statespace_filters.advice import missed
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
-from pymc_statespace_filters.evidence import estimation, runner
+from pymc_statespace_filters.evidence import estimation
 from pymc_statespace_filters.evidence.comparison.scaled_prior import average_ratios
+from pymc_statespace_filters.evidence.facts import PartsOfPosterior
 from pymc_statespace_filters.evidence.pooled import Pooled
 from pymc_statespace_filters.evidence.posterior import Posterior
 from pymc_statespace_filters.evidence.reweighting.correction import correct
 from pymc_statespace_filters.evidence.shorter_steps import _changes
+from pymc_statespace_filters.facts import sentences
 from pymc_statespace_filters.importance import mcse, mcse_of_populations
 from pymc_statespace_filters.pymc_model.posterior_draws import BY_PARTICLES, populations_of
 from tests.evidence.targets import Regression
@@ -150,13 +153,13 @@ def test_populations_are_read_from_the_result():
 
 
 def test_what_chains_have_missed_is_not_looked_for_in_populations(monkeypatch):
-    monkeypatch.setattr(runner, "unvisited", lambda *args: ["the chains have missed a part"])
+    monkeypatch.setattr(missed, "unvisited", lambda *args: ["the chains have missed a part"])
     x = np.zeros((4, 1000, 2))
     posterior, rng = Posterior(x, log_density(x), log_density), np.random.default_rng(1)
     tree = xr.DataTree()
-    assert runner._missed(tree, None, posterior, rng)
+    assert sentences(PartsOfPosterior(tree, None, posterior, rng))
     tree.attrs["sampler"] = BY_PARTICLES
-    assert not runner._missed(tree, None, posterior, rng)
+    assert not sentences(PartsOfPosterior(tree, None, posterior, rng))
 
 
 def test_the_default_is_importance_sampling(monkeypatch):

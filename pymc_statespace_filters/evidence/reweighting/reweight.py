@@ -12,12 +12,11 @@ import xarray as xr
 
 from ...compiler.native.compilation import COMPILATION
 from ...errors import INSIDE, EvidenceWarning, FilterWarning, ModelError
-from ...filter_checks.checks import MORE_POINTS, check_at_end, doubts, store
+from ...facts import in_words
 from ...filters.protocol import Filter
 from ...filters.written import short_form
 from ...importance import MIN_EFFECTIVE, largest_good_k, pareto_k
 from ...parallel.cpu_affinity import cores_set_to
-from ...parallel.shared_rows import by_first_rank
 from ...progress import row_progress
 from ...pymc_model.density import ModelDensity
 from ...pymc_model.in_step import shared_by_ranks
@@ -25,6 +24,7 @@ from ...pymc_model.other_filter import model_of_draws
 from ...pymc_model.posterior_draws import MIN_DRAWS, noise_was_moved, posterior_group
 from ...system.checks import check_count, check_random_seed, is_integer
 from ..exact_density import ExactDensity
+from ..facts import CorrectingFilter
 from ..posterior_of_draws import build_posterior
 from .correction import MOST_ESTIMATES, Correction, correct, seeds_needed
 from .result import reweighted_tree
@@ -187,13 +187,10 @@ def reweight(
         tree = reweighted_tree(idata, draws, found, exact, rng)
         own = np.random.default_rng(rng.integers(2**63))
         seconds = time.process_time() - began
-        given = tree, model, filter, seconds, own, MORE_POINTS
-        outcomes = by_first_rank(lambda: check_at_end(*given))
-    attrs = _attributes(found, exact)
-    tree.attrs |= attrs
-    store(tree, outcomes)
-    if off := doubts(outcomes):  # by which the weights are as they are
-        warnings.warn("; ".join(off), FilterWarning, skip_file_prefixes=INSIDE)
+        tree.attrs |= (attrs := _attributes(found, exact))
+        off = in_words(CorrectingFilter(tree, model, filter, seconds, own))
+    if off:  # by which the weights are as they are
+        warnings.warn(off, FilterWarning, skip_file_prefixes=INSIDE)
         return tree
     for problem in _problems(attrs, filter):
         warnings.warn(problem, EvidenceWarning, skip_file_prefixes=INSIDE)
