@@ -246,3 +246,28 @@ def test_compilation_gives_the_memory_of_pass_managers_back():
     for _ in range(300):
         codegen._module_pass_manager()
     assert resident_mb() - before < 4  # of 9
+
+
+def rooms():
+    """Folders and files at the top of the package, as documents write them."""
+    package = ROOT / "pymc_statespace_filters"
+    folders = {f"{file.parent.name}/" for file in package.glob("*/__init__.py")}
+    return folders | {file.name for file in package.glob("*.py")} - {"__init__.py"}
+
+
+def test_contributing_names_every_room_once():
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    table = text.partition("| package | contents |")[2].partition("\n\n")[0]
+    named = re.findall(r"`([\w/.]+)`", "".join(row.split("|")[1] for row in table.split("\n")[2:]))
+    assert sorted(named) == sorted(rooms())
+
+
+def test_the_picture_of_the_design_is_that_of_the_contracts():
+    tools = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]
+    (contract,) = [c for c in tools["importlinter"]["contracts"] if c["id"] == "layers"]
+    layers = [[name.strip() for name in line.split("|")] for line in contract["layers"]]
+    text = (ROOT / "docs/explanation/design.md").read_text(encoding="utf-8")
+    picture = text.partition("```text\n")[2].partition("```")[0].splitlines()
+    assert len(picture) == len(layers)
+    for line, names in zip(picture[:-1], layers[:-1], strict=True):
+        assert re.split(r"\s{2,}", line.strip())[: len(names)] == names
