@@ -1,6 +1,7 @@
 """Every filter that a message recommends takes the very system, and is not the one in use."""
 
 import re
+import warnings
 
 import numpy as np
 import pymc as pm
@@ -195,3 +196,38 @@ def test_a_filter_of_the_same_likelihood_with_less_noise(changes, filter, expect
     if "initial_mean" in changes:
         changes = changes | dict(transition=lambda x, q: [pt.sin(x[1]) + q[0], x[0] + q[1]])
     assert quiet_filter(compile_system(system(**changes)), filter) == expected
+
+
+def test_a_sensor_of_a_product_is_not_sent_to_a_guide():
+    """More plain particles find the log-likelihood that 1e5 do; 100 guided ones lie far below."""
+    product = psf.StateSpaceModel(
+        transition=lambda x, q: 0.9 * x + 0.5 * q, process_noise=np.eye(2),
+        observation=lambda x: [x[0] * x[1]], observation_noise=[[0.01]],
+        initial_mean=[0.5, 0.5], initial_cov=np.eye(2),
+    )  # fmt: skip
+    remedy = collapse_remedy(compile_system(product), psf.BootstrapPF(1000))
+    assert remedy.startswith("Use more particles; psf.suggest_particles finds how many. GuidedPF")
+    steps = np.arange(1, 31)
+    observed = psf.simulate(product, {}, steps=steps, random_seed=3)["observations"].values
+
+    def log_likelihood(filter, n_seeds):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", psf.errors.FilterWarning)
+            terms = psf.log_likelihood(
+                product, filter, {}, observed, steps=steps, seed=np.arange(n_seeds)
+            )
+        return np.median(terms.sum(axis=1))
+
+    true = log_likelihood(psf.BootstrapPF(100_000), 3)
+    assert log_likelihood(psf.BootstrapPF(20_000), 5) == pytest.approx(true, abs=1.0)
+    assert log_likelihood(psf.GuidedPF(100), 20) < true - 4.0
+
+
+def test_a_linear_sensor_is():
+    linear = psf.StateSpaceModel(
+        transition=lambda x, q: [0.9 * x[0] + 0.5 * q[0], x[1] - 0.1 * x[1] ** 3 + q[1]],
+        process_noise=np.eye(2), observation=lambda x: [x[0] + x[1]], observation_noise=[[0.01]],
+        initial_mean=[0.5, 0.5], initial_cov=np.eye(2),
+    )  # fmt: skip
+    remedy = collapse_remedy(compile_system(linear), psf.BootstrapPF(1000))
+    assert remedy.startswith("Use GuidedPF(100), which moves particles to the data")

@@ -316,6 +316,11 @@ class CompiledSystem:
         return structure.has_smooth_sensor(self.asked)
 
     @cached_property
+    def has_linear_sensor(self) -> bool:
+        """Whether an observation with noise is linear in state and noise; False if unknown."""
+        return structure.has_linear_observation(self.asked)
+
+    @cached_property
     def has_exact_sensor(self) -> bool:
         """Whether a sensor has no noise; False if unknown."""
         return structure.has_exact_sensor(self.asked)
