@@ -38,20 +38,22 @@ def step_problems(tree: DataTree, model: Model) -> list[str]:
     differences = accuracy(_some(draws, _N_POINTS))
     if differences.max() < _LEAST_DIFFERENCE:
         return []
+    too_long = (
+        f"The integration steps of {max(step_lengths(model)):g} are too long for the equations here"
+    )
     if np.median(differences) >= _UNSTABLE:
-        found = "a single one multiplies small deviations otherwise than two half as long"
-    elif (shift := _shift(model, _some(draws, _N_DRAWS))) >= _MOST_SHIFT:
-        found = (
-            f"with steps half as long the posterior would move by {shift:.1f} standard deviations "
-            "or more"
-        )
-    else:
-        return []
-    return [
-        f"The integration steps of {max(step_lengths(model)):g} are too long for the equations "
-        f"here: {found}. Take four times as many substeps, or an integrator of higher order, "
-        "until this is no longer said; psf.step_error measures what is left."
-    ]
+        return [
+            f"{too_long}: a single one multiplies small deviations otherwise than two half as long."
+            " Take LocalLinearization, which follows fast decays with long steps; where the noise "
+            "depends on the state, four times as many substeps until this is no longer said."
+        ]
+    if (shift := _shift(model, _some(draws, _N_DRAWS))) >= _MOST_SHIFT:
+        return [
+            f"{too_long}: with steps half as long the posterior would move by {shift:.1f} standard "
+            "deviations or more. Take four times as many substeps, or an integrator of higher "
+            "order, until this is no longer said; psf.step_error measures what is left."
+        ]
+    return []
 
 
 def _shift(model: Model, x: Array) -> float:

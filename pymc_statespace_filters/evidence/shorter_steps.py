@@ -1,18 +1,20 @@
 """What a shorter integration step would change: the log-likelihood and the log-evidence."""
 
 import warnings
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Iterator, Sequence
+from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.special import logsumexp
+from pytensor.tensor.variable import TensorVariable
+from scipy.special import logsumexp, softmax
 
 from ..errors import EvidenceWarning
-from ..importance import MAX_PARETO_K, MIN_EFFECTIVE, mcse, pareto_k
+from ..importance import MAX_PARETO_K, MIN_EFFECTIVE, log_mean_of_draws, mcse, normalised, pareto_k
 from ..progress import row_progress
 from ..pymc_model.checked_model import checked_model
 from ..pymc_model.density import RowFunction, check_free_variables
@@ -21,7 +23,7 @@ from ..pymc_model.step_refinement import densities_by_halvings, step_lengths
 from ..system.checks import check_count, check_random_seed
 
 N_SEEDS = 8  # of a noisy likelihood, at every draw
-MAX_CORRECTION = 0.1  # nats, of the bias of a ratio of means over these seeds
+MAX_NOISE = 0.1  # relative variance of the ratio of means over these seeds
 
 COLUMNS = ("log_lik_change", "log_lik_se", "log_evidence_change", "log_evidence_se")
 
@@ -87,7 +89,7 @@ def step_error(
     EvidenceWarning
         If the likelihood is zero at some draws with either step; if few draws decide the change of
         the log-evidence, or the estimates are too noisy for it, so that its error is larger than it
-        says (NaN where nothing can be said).
+        says.
 
     Notes
     -----
@@ -129,139 +131,120 @@ def step_error(
     check_count("halvings", halvings, 1)
     check_count("n_draws", n_draws, MIN_DRAWS)
     rng = check_random_seed(random_seed)
-    draws = unconstrained_draws(idata, model)
+    draws, population = unconstrained_draws(idata, model), populations_of(idata)
     n_chains, length = draws.shape[:2]
     each = min(length, max(1, n_draws // n_chains))
     rows = np.linspace(0, length - 1, each).round().astype(int)
-    draws, population = draws[:, rows], populations_of(idata)
     if population is not None:
         population = population[:, rows]
-    functions = [RowFunction(model, graph) for graph in densities_by_halvings(model, halvings)]
-    coarse, *finer = _at_draws(functions, draws, rng, progressbar)
-    row_of = partial(_changes, coarse=coarse, shape=draws.shape[:2], population=population)
-    found = [row_of(fine, jackknife=True) for fine in finer]
-    lengths = max(step_lengths(model)) * 0.5 ** np.arange(1, halvings + 1)
-    table = pd.DataFrame(found, index=pd.Index(lengths, name="dt"))
-    plain = [row_of(fine, jackknife=False) for fine in finer]
-    corrections = np.abs(table - pd.DataFrame(plain, index=table.index))["log_evidence_change"]
-    _warn_of_failures(finer, coarse)
-    for (dt, row), fine, correction in zip(table.iterrows(), finer, corrections, strict=True):
-        log_ratio = _log_ratio(fine, coarse)
-        if not np.isfinite(log_ratio).any():
-            continue  # which `_warn_of_failures` has said
-        if correction <= MAX_CORRECTION:
-            _warn_of_weights(dt, row["log_evidence_se"], log_ratio)
-        else:
-            _warn_of_noise(dt)
-    return table
+    graphs = densities_by_halvings(model, halvings)
+    coarse, *finer = _log_densities(model, graphs, draws[:, rows], rng, progressbar=progressbar)
+    dt = pd.Index(max(step_lengths(model)) * 0.5 ** np.arange(1, halvings + 1), name="dt")
+    changes = [_change(coarse, fine, population) for fine in finer]
+    for text in (*_zeros(coarse, finer), *chain.from_iterable(map(_doubts, dt, changes))):
+        warnings.warn(text, EvidenceWarning, stacklevel=2)
+    return pd.DataFrame([one[: len(COLUMNS)] for one in changes], dt, COLUMNS)
 
 
-def _at_draws(
-    functions: list[RowFunction], draws: Array, rng: np.random.Generator, progressbar: bool
+def _log_densities(
+    model: pm.Model,
+    graphs: Sequence[TensorVariable],
+    draws: Array,
+    rng: np.random.Generator,
+    *,
+    progressbar: bool,
 ) -> list[Array]:
-    """Log-densities (draws, seeds) by each of the functions, with the same seeds for all."""
-    x = draws.reshape(-1, draws.shape[-1])
-    n_seeds = N_SEEDS if functions[0].seed_names else 1
-    x = np.repeat(x, n_seeds, axis=0)
-    size = (len(x), len(functions[0].seed_names))
-    seeds = rng.integers(np.iinfo(np.int64).max, size=size)
+    """Log-densities (chain, draw, seed) at the draws by each of the graphs, with the same seeds."""
+    functions = [RowFunction(model, graph) for graph in graphs]
+    seed_names = functions[0].seed_names
+    n_seeds = N_SEEDS if seed_names else 1
+    x = np.repeat(draws.reshape(-1, draws.shape[-1]), n_seeds, axis=0)
+    seeds = rng.integers(np.iinfo(np.int64).max, size=(len(x), len(seed_names)))
     found = []
-    for halvings, one in enumerate(functions):
-        with row_progress(one.calls, enabled=progressbar) as announce:
+    for halvings, function in enumerate(functions):
+        with row_progress(function.calls, enabled=progressbar) as announce:
             announce(f"step halved {halvings} times" if halvings else "step as it is", len(x))
-            found.append(one.evaluate(x, seeds).reshape(-1, n_seeds))
+            found.append(function.evaluate(x, seeds).reshape(*draws.shape[:2], n_seeds))
     return found
 
 
-def _changes(
-    fine: Array,
-    coarse: Array,
-    shape: tuple[int, int],
-    population: NDArray[np.int64] | None,
-    *,
-    jackknife: bool,
-) -> dict[str, float]:
-    """A row of the table from log-densities (draws, seeds); ``shape`` is (chains, draws)."""
-    usable = np.isfinite(coarse).any(axis=1)  # the others are no draws of the posterior
-    log_ratio = np.where(usable, _log_ratio(fine, coarse), np.nan)
-    peak = np.nanmax(log_ratio, initial=-np.inf)
-    if peak == -np.inf:
-        return dict.fromkeys(COLUMNS, np.nan)
+class _Change(NamedTuple):
+    """A row of the table, and what tells whether it can be believed."""
 
-    def ratio(some_fine: Array, some_coarse: Array) -> Array:
-        return np.exp(_log_ratio(some_fine, some_coarse) - peak)
-
-    change, weight = log_ratio, np.exp(log_ratio - peak)
-    if jackknife:
-        change = _jackknifed(_log_ratio, fine, coarse, log_ratio)
-        weight = _jackknifed(ratio, fine, coarse, weight)
-    change = np.where(np.isfinite(change), change, np.nan).reshape(shape)
-    weight, mean = weight.reshape(shape), float(np.nanmean(weight))
-    numbers = [np.nanmean(change), _standard_error(change, population), np.nan, np.nan]
-    if mean > 0:  # not where the corrections of large noise outweigh the ratios
-        numbers[2:] = np.log(mean) + peak, _standard_error(weight, population) / mean
-    return dict(zip(COLUMNS, map(float, numbers), strict=True))
+    log_lik_change: float
+    log_lik_se: float
+    log_evidence_change: float
+    log_evidence_se: float
+    log_ratio: Array  # (chain, draw)
+    noise: float  # variance of the log-ratio of a draw, due to the noise
 
 
-def _log_ratio(fine: Array, coarse: Array) -> Array:
-    """Log of the ratio of the means over the seeds, (draws,); NaN for zero by zero."""
-    with np.errstate(invalid="ignore"):
-        return logsumexp(fine, axis=1) - logsumexp(coarse, axis=1)
+def _change(coarse: Array, fine: Array, population: NDArray[np.int64] | None) -> _Change:
+    """From log-densities (chain, draw, seed)."""
+    log_ratio = _log_ratio(coarse, fine)
+    known = np.isfinite(log_ratio)
+    if not known.any():
+        return _Change(np.nan, np.nan, np.nan, np.nan, log_ratio, np.nan)
+    of_log, of_ratio, noise = _biases(coarse[known], fine[known])
+    change, ratio = log_ratio[known], log_mean_of_draws(log_ratio, population)
+    # A draw without a likelihood by its own step is none of the posterior.
+    share = np.isfinite(coarse).any(axis=-1).mean()
+    return _Change(
+        float((change - of_log).mean()),
+        mcse(np.where(known, log_ratio, change.mean()), population) / known.mean() ** 0.5,
+        ratio.value - float(np.log(share) + normalised(change) @ of_ratio),
+        ratio.error,
+        log_ratio,
+        float(noise.mean()),
+    )
 
 
-def _jackknifed(
-    statistic: Callable[[Array, Array], Array], fine: Array, coarse: Array, whole: Array
-) -> Array:
-    """A statistic of the seeds without its bias of first order in their number."""
-    n_seeds = fine.shape[1]
-    if n_seeds == 1:
-        return whole
-    others = [np.delete(np.arange(n_seeds), i) for i in range(n_seeds)]
-    with np.errstate(invalid="ignore", over="ignore"):
-        parts = np.mean([statistic(fine[:, o], coarse[:, o]) for o in others], axis=0)
-        corrected = n_seeds * whole - (n_seeds - 1) * parts
-    return np.where(np.isfinite(parts), corrected, whole)
+def _log_ratio(coarse: Array, fine: Array) -> Array:
+    """Log of the ratio of the means over the seeds; minus infinity where it is not known."""
+    with np.errstate(invalid="ignore"):  # zero by zero
+        found = logsumexp(fine, axis=-1) - logsumexp(coarse, axis=-1)
+    return np.where(np.isfinite(found), found, -np.inf)
 
 
-def _standard_error(values: Array, population: NDArray[np.int64] | None) -> float:
-    """Of the mean of correlated values (chain, draw), those that are NaN left out."""
-    known = np.isfinite(values)
-    filled = np.where(known, values, np.nanmean(values))
-    if np.ptp(filled) == 0.0:  # such as by an integrator that is exact
-        return 0.0
-    return mcse(filled, population) / known.mean() ** 0.5
+def _biases(coarse: Array, fine: Array) -> tuple[Array, Array, Array]:
+    """Of first order in the number of seeds, from log-densities (draw, seed).
+
+    Of the log of the ratio of their means; of that ratio, relative to it; and the variance of both.
+    """
+    n_seeds = coarse.shape[-1]
+    below, above = (softmax(logs, axis=-1) * n_seeds - 1.0 for logs in (coarse, fine))
+    pairs = n_seeds * max(n_seeds - 1, 1)
+    of_log = (below**2 - above**2).sum(axis=-1) / (2 * pairs)
+    of_ratio = (below * (below - above)).sum(axis=-1) / pairs
+    return of_log, of_ratio, ((below - above) ** 2).sum(axis=-1) / pairs
 
 
-def _warn_of_failures(finer: list[Array], coarse: Array) -> None:
-    without = [~np.isfinite(logs).any(axis=1) for logs in (coarse, *finer)]
+def _zeros(coarse: Array, finer: Sequence[Array]) -> Iterator[str]:
+    without = [~np.isfinite(logs).any(axis=-1) for logs in (coarse, *finer)]
     if (n_failed := int(np.any(without, axis=0).sum())) > 0:
-        _warn(
-            f"the likelihood is zero at {n_failed} of {len(coarse)} draws with the model's step or "
-            "with a shorter one: log_lik_change leaves them out, and log_evidence_change counts "
-            "those without a likelihood by the shorter step as zero"
+        yield (
+            f"the likelihood is zero at {n_failed} of {without[0].size} draws with the model's "
+            "step or with a shorter one: log_lik_change leaves them out, and log_evidence_change "
+            "counts those without a likelihood by the shorter step as zero"
         )
 
 
-def _warn_of_weights(dt: float, error: float, log_ratio: Array) -> None:
-    tail = pareto_k(np.where(np.isfinite(log_ratio), log_ratio, -np.inf))
+def _doubts(dt: float, change: _Change) -> Iterator[str]:
+    if not np.isfinite(change.log_ratio).any():
+        return  # which `_zeros` has said
+    if change.noise > MAX_NOISE:
+        yield (
+            f"the estimates of the likelihood are too noisy for log_evidence_change at dt = {dt:g}:"
+            f" the ratio of their means over {N_SEEDS} seeds has a relative variance of "
+            f"{change.noise:.2g} at a draw, and a bias that is not removed exactly. Give the model "
+            "a filter with more particles, or GuidedPF; the draws can stay"
+        )
+        return
+    tail, error = pareto_k(change.log_ratio), change.log_evidence_se
     if tail > MAX_PARETO_K or not error <= MIN_EFFECTIVE**-0.5:
-        _warn(
+        yield (
             f"few draws decide log_evidence_change at dt = {dt:g} (Pareto k = {tail:.2g}, "
             f"standard error {error:.2g}): the posterior with the shorter step lies elsewhere, or "
             "the draws are too few. Take the shorter step in the model and sample again; if "
             "log_lik_change is small, raise n_draws"
         )
-
-
-def _warn_of_noise(dt: float) -> None:
-    """Warn that the bias which the jackknife removes is large, because then some of it is left."""
-    _warn(
-        f"the estimates of the likelihood are too noisy for log_evidence_change at dt = {dt:g}: "
-        f"the ratio of their means over {N_SEEDS} seeds has a bias above {MAX_CORRECTION:g} nats, "
-        "which is not removed exactly. Give the model a filter with more particles, or GuidedPF; "
-        "the draws can stay"
-    )
-
-
-def _warn(text: str) -> None:
-    warnings.warn(text, EvidenceWarning, stacklevel=4)

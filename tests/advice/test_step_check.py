@@ -54,3 +54,30 @@ def test_draws_that_do_not_vary_tell_nothing(record):
         observed = record["observations"]
         psf.StateSpace("d", decay(0.5), psf.EKF(), steps=range(1, 101), observed=observed)
     assert step_problems(xr.DataTree.from_dict({"posterior": stuck}), model) == []
+
+
+def stiff(integrator=psf.EulerMaruyama, **options):
+    """A decay at forty times the rate of the steps, which longer ones of any order amplify."""
+    return psf.StateSpaceModel(
+        integrator(lambda x, level: [400 * (level - x[0])], [[0.5]], dt=0.1, **options),
+        observation=lambda x: [x[0]],
+        observation_noise=[[0.05**2]],
+        initial_mean=[1.0],
+        initial_cov=[[0.1]],
+    )
+
+
+@pytest.mark.parametrize("integrator", [psf.EulerMaruyama, psf.RungeKutta4])
+def test_the_advice_for_unstable_steps_ends_the_warning(integrator):
+    draws = xr.Dataset({"level": (("chain", "draw"), np.linspace(1.9, 2.1, 200).reshape(2, 100))})
+    tree = xr.DataTree.from_dict({"posterior": draws})
+
+    def problems(system):
+        with pm.Model() as model:
+            pm.Normal("level", 0, 5)
+            psf.StateSpace("d", system, psf.EKF(), steps=[1, 2, 3], observed=[2.0, 2.1, 1.9])
+        return step_problems(tree, model)
+
+    (said,) = problems(stiff(integrator))
+    assert "Take LocalLinearization" in said
+    assert problems(stiff(psf.LocalLinearization)) == []

@@ -17,7 +17,7 @@ from pymc_statespace_filters.evidence.facts import PartsOfPosterior
 from pymc_statespace_filters.evidence.pooled import Pooled
 from pymc_statespace_filters.evidence.posterior import Posterior
 from pymc_statespace_filters.evidence.reweighting.correction import correct
-from pymc_statespace_filters.evidence.shorter_steps import _changes
+from pymc_statespace_filters.evidence.shorter_steps import _change
 from pymc_statespace_filters.facts import sentences
 from pymc_statespace_filters.importance import mcse, mcse_of_populations
 from pymc_statespace_filters.pymc_model.posterior_draws import BY_PARTICLES, populations_of
@@ -49,9 +49,8 @@ def in_turn(scatter):
 
 
 def of_step_error(terms, population):
-    coarse = np.zeros((terms.size, 1))
-    found = _changes(0.01 * terms.reshape(-1, 1), coarse, terms.shape, population, jackknife=False)
-    return [found["log_lik_se"], found["log_evidence_se"]]
+    found = _change(np.zeros((*terms.shape, 1)), 0.01 * terms[..., None], population)
+    return [found.log_lik_se, found.log_evidence_se]
 
 
 def of_scaled_priors(terms, population):
