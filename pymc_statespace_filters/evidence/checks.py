@@ -29,11 +29,12 @@ from numpy.typing import NDArray
 from scipy.special import softmax
 from scipy.stats import rankdata
 
+from ..errors import ModelError
 from ..lower_chains import lower_chains
 from ..pymc_model.density import RowFunction
 from ..pymc_model.elements import labels_of
 from ..pymc_model.posterior_draws import are_populations
-from ..pymc_model.step_refinement import densities_by_steps, step_stability
+from ..pymc_model.step_refinement import densities_by_halvings, step_stability
 from .observed_data import scalar_count
 from .posterior import Posterior
 
@@ -93,8 +94,8 @@ def _drawn_by_us(idata: xr.DataTree | None) -> bool:
 def check_discretisation(model: pm.Model, idata: xr.DataTree, draws: Array) -> Iterator[str]:
     """Yield a reason if draws (chain, draw, k) overshoot, or end at the stability limit.
 
-    Models without an integrator, and systems that no deterministic filter can treat, are not
-    checked.
+    Models without an integrator, and systems that their filter cannot treat with shorter steps, are
+    not checked.
     """
     is_stable = step_stability(model)
     if is_stable is None:
@@ -105,7 +106,11 @@ def check_discretisation(model: pm.Model, idata: xr.DataTree, draws: Array) -> I
     beyond = flat.mean(axis=0) + BEYOND * (x - flat.mean(axis=0))
     # The eigenvalues are cheap; what follows compiles two filters, which few models need.
     overshoots = ~is_stable(np.concatenate([x, beyond]))
-    if overshoots.sum() < MIN_DRAWS or (densities := densities_by_steps(model)) is None:
+    if overshoots.sum() < MIN_DRAWS:
+        return
+    try:
+        densities = densities_by_halvings(model, 1)
+    except ModelError:
         return
     coarse, fine = (RowFunction(model, density).evaluate for density in densities)
     limit = max(LOSS, LOSS_OF_A_SCALAR * scalar_count(model))

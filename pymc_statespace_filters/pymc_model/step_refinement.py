@@ -14,8 +14,7 @@ from ..compiler.lowering.compiled_system import compile_system
 from ..compiler.lowering.symbols import call, jacobian_of, symbols_of
 from ..compiler.native.rows import interpreted_at_points
 from ..errors import ModelError
-from ..filters.ekf import EKF
-from ..filters.protocol import EnsembleFilter, Filter
+from ..filters.protocol import EnsembleFilter
 from ..filters.signatures import PANEL
 from ..system.input_columns import divided, with_resets
 from ..system.integrators.substeps import CoupledNoise
@@ -29,31 +28,6 @@ STEPS_PER_JACOBIAN = 10
 _ANY_FACTOR = np.array([[-1e9 + 0j]])
 
 Array = NDArray[np.float64]
-
-
-def densities_by_steps(model: pm.Model) -> tuple[TensorVariable, TensorVariable] | None:
-    """A model's log-density with its integration steps, and with steps half as long.
-
-    Both use deterministic filters: the EKF where it can treat the system, else the filter of the
-    variable. None if no variable has an integrator, or if one has no deterministic filter.
-    """
-    log_density = model.logp()
-    coarse: dict[Variable, Variable] = {}
-    fine: dict[Variable, Variable] = {}
-    nodes = likelihood_nodes([log_density])
-    if not any(node.op.system.integrator for node in nodes):
-        return None
-    for node in nodes:
-        system = refined = node.op.system
-        if system.integrator is not None:
-            refined = system.with_integrator(system.integrator.refined())
-        filter = _deterministic_filter(system, refined, node.op.filter)
-        if filter is None:
-            return None
-        for replaced, version in ((coarse, system), (fine, refined)):
-            outputs = node.op.of(version, filter)(*node.inputs)
-            replaced |= dict(zip(node.outputs, outputs, strict=True))
-    return clone_replace(log_density, coarse), clone_replace(log_density, fine)
 
 
 def densities_by_halvings(model: pm.Model, halvings: int) -> list[TensorVariable]:
@@ -288,19 +262,3 @@ def _compile_path(system: StateSpaceModel, examined: Sequence[StateSpaceModel]) 
         interpreted_at_points([theta], start),
         *(interpreted_at_points(now, graph) for graph in graphs),
     ]
-
-
-def _deterministic_filter(
-    system: StateSpaceModel, refined: StateSpaceModel, filter_of_variable: Filter
-) -> Filter | None:
-    """A deterministic filter that can treat both systems."""
-    candidates: tuple[Any, ...] = (EKF(), filter_of_variable)
-    for filter in candidates:
-        try:
-            filter.check(compile_system(system))
-            filter.check(compile_system(refined))
-        except ModelError:
-            continue
-        if not filter.noisy:
-            return filter
-    return None

@@ -15,7 +15,7 @@ from pymc_statespace_filters.evidence import checks
 from pymc_statespace_filters.evidence.checks import check_discretisation
 from pymc_statespace_filters.pymc_model.density import RowFunction
 from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
-from pymc_statespace_filters.pymc_model.step_refinement import densities_by_steps
+from pymc_statespace_filters.pymc_model.step_refinement import densities_by_halvings
 
 POSITION = {"observation": lambda x: [x[0]]}
 
@@ -63,7 +63,7 @@ def test_the_mirror_mode_of_a_linear_state(substeps, mirror):
     assert "raise substeps, or give a prior that excludes them" in doubt
 
 
-def test_other_filters_are_judged_by_the_ekf():
+def test_estimates_of_particles_show_it_too():
     model = linear_model(linear(), filter=psf.BootstrapPF(20))
     (doubt,) = doubts(model, near(-1.0, -19.0, -19.0, -19.0))
     assert re.match(r"[678]\d% of the draws \(a in -19", doubt)
@@ -99,7 +99,7 @@ def test_a_likelihood_that_depends_on_the_step_without_overshooting_is_no_doubt(
         psf.StateSpace("d", system, psf.EKF(), steps=steps, observed=record.values)
     idata = az.from_dict({"posterior": {"c": 0.3 + 1e-4 * near(0.0)["posterior"]["a"].values}})
     x = unconstrained_draws(idata, model).reshape(-1, 1)[:5]
-    coarse, fine = (RowFunction(model, g).evaluate(x) for g in densities_by_steps(model))
+    coarse, fine = (RowFunction(model, g).evaluate(x) for g in densities_by_halvings(model, 1))
     assert (coarse - fine > 20).all()
     assert doubts(model, idata) == []
 
@@ -181,7 +181,7 @@ class TestRules:
             pm.Normal("y", 0 * a, 1, observed=np.zeros(size))
         value = model.rvs_to_values[a]
         densities = model.logp(), model.logp() - lost(value)
-        monkeypatch.setattr(checks, "densities_by_steps", lambda model: densities)
+        monkeypatch.setattr(checks, "densities_by_halvings", lambda model, halvings: densities)
         monkeypatch.setattr(
             checks,
             "step_stability",
