@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from ..parallel.shared_rows import by_first_rank
-from ..sampling.checkpoint.checkpoint import Checkpoint, checked_folder, open_checkpoint
+from ..sampling.checkpoint.checkpoint import checked_folder, open_checkpoint
+from ..sampling.checkpoint.record_file import RecordFile
 
 SECONDS = 5.0  # between two records
 _KEY = "particles"
@@ -29,7 +30,7 @@ class StoredSteps:
         The last step, on all ranks; empty at the beginning.
     """
 
-    def __init__(self, found: Arrays | None = None, checkpoint: Checkpoint | None = None) -> None:
+    def __init__(self, found: Arrays | None = None, checkpoint: RecordFile | None = None) -> None:
         self.found = found or {}
         self._checkpoint, self._saved_at = checkpoint, time.monotonic()
 
@@ -51,18 +52,18 @@ def steps_stored_in(
     Raises
     ------
     DataMismatchError, ModelError, CheckpointError
-        As `open_checkpoint` and `Checkpoint.read`.
+        As `open_checkpoint` and `RecordFile.read`.
     """
     if folder is None:
         yield StoredSteps()
         return
-    opened: list[Checkpoint] = []
+    opened: list[RecordFile] = []
     with ExitStack() as stack:
 
         def begin() -> Arrays:
             checkpoint = open_checkpoint(checked_folder(folder), settings())
             opened.append(stack.enter_context(checkpoint))
-            stored = checkpoint.read(_KEY)
+            stored = opened[0].read(_KEY)
             return {} if stored is None else stored.state
 
         found = by_first_rank(begin)

@@ -214,10 +214,10 @@ def test_every_altered_byte_is_noticed(tmp_path):
     for at in range(ends[0]):
         path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
         with pytest.raises(ModelError, match=r"damaged|another version"):
-            open_checkpoint(tmp_path, SETTINGS)
+            read(tmp_path, SETTINGS)
         path.write_bytes(whole[:at])
         with pytest.raises(ModelError, match=r"damaged|another version"):
-            open_checkpoint(tmp_path, SETTINGS)
+            read(tmp_path, SETTINGS)
     path.write_bytes(whole)
     assert_holds(read(tmp_path), 4)
 
@@ -286,26 +286,26 @@ def test_a_file_that_another_process_has_touched_is_left_alone(tmp_path):
     path, _ = write(tmp_path, [2])
     with open_checkpoint(tmp_path, SETTINGS) as checkpoint:
         other = record_file.RecordFile(path, record_file.header_of(path))
-        other.append(record_file.encoded(KEY, draws_of(2, 1), state_of(3)))
+        other.append(KEY, draws_of(2, 1), state_of(3))
         with pytest.raises(CheckpointError, match="another process has written to this file"):
             append_all(checkpoint, [1], first=2)
         path.unlink()
         with pytest.raises(CheckpointError, match=r"run\.checkpoint is gone: it was moved or"):
-            other.append(record_file.encoded(KEY, draws_of(3, 1), state_of(4)))
+            other.append(KEY, draws_of(3, 1), state_of(4))
 
 
 @pytest.mark.parametrize("name", ["run.checkpoint", "run.unfinished", "run.owner"])
 def test_a_folder_in_the_place_of_a_file_is_named(tmp_path, name):
     (tmp_path / name).mkdir()
     with pytest.raises(ModelError, match=rf"cannot be written to \({IS_FOLDER} at {name}\)"):
-        open_checkpoint(tmp_path, SETTINGS)
+        read(tmp_path, SETTINGS)
 
 
 def test_other_arguments_are_named_with_both_values(tmp_path):
     write(tmp_path, [2])
     settings = {"draws": 2000, "chains": 2, "model": "77aa", "stages": [2, 1], "cores": 1}
     with pytest.raises(DataMismatchError) as caught:
-        open_checkpoint(tmp_path, settings)
+        read(tmp_path, settings)
     assert str(caught.value) == (
         f"checkpoint={str(tmp_path)!r} is of another run: "
         "draws: the checkpoint has 1000, this run has 2000; "
@@ -319,21 +319,21 @@ def test_other_arguments_are_named_with_both_values(tmp_path):
 
 @pytest.mark.parametrize("value", [0.1 + 0.2, float("nan"), (1, 2), {"b": 1, "a": None}, "ü"])
 def test_equal_arguments_are_equal_after_a_round_trip(tmp_path, value):
-    open_checkpoint(tmp_path, {"it": value, "more": 1}).close()
-    open_checkpoint(tmp_path, {"more": 1, "it": value}).close()
+    read(tmp_path, {"it": value, "more": 1})
+    read(tmp_path, {"more": 1, "it": value})
 
 
 @pytest.mark.parametrize(("one", "other"), [(1, 1.0), (1, True), (0.1 + 0.2, 0.3), (None, 0)])
 def test_arguments_of_another_type_are_others(tmp_path, one, other):
-    open_checkpoint(tmp_path, {"it": one}).close()
+    read(tmp_path, {"it": one})
     with pytest.raises(DataMismatchError, match="it: the checkpoint has"):
-        open_checkpoint(tmp_path, {"it": other})
+        read(tmp_path, {"it": other})
 
 
 def test_long_arguments_are_shortened_in_the_message(tmp_path):
-    open_checkpoint(tmp_path, {"start": [0] * 10_000}).close()
+    read(tmp_path, {"start": [0] * 10_000})
     with pytest.raises(DataMismatchError) as caught:
-        open_checkpoint(tmp_path, {"start": [1] * 10_000})
+        read(tmp_path, {"start": [1] * 10_000})
     assert len(str(caught.value)) < 500
 
 
@@ -341,13 +341,13 @@ def test_another_version_is_refused(tmp_path):
     path, _ = write(tmp_path, [])
     path.write_bytes(path.read_bytes().replace(b"checkpoint 3", b"checkpoint 7"))
     with pytest.raises(ModelError, match="has the format 7 of another version of this package"):
-        open_checkpoint(tmp_path, SETTINGS)
+        read(tmp_path, SETTINGS)
 
 
 def test_another_file_of_that_name_is_refused_and_left_alone(tmp_path):
     (tmp_path / "run.checkpoint").write_text("something else", encoding="utf-8")
     with pytest.raises(ModelError, match=r"its run\.checkpoint is damaged or not of a checkpoint"):
-        open_checkpoint(tmp_path, SETTINGS)
+        read(tmp_path, SETTINGS)
     assert (tmp_path / "run.checkpoint").read_text(encoding="utf-8") == "something else"
 
 
@@ -355,16 +355,16 @@ def test_paths_that_cannot_be_folders_are_refused(tmp_path):
     file = tmp_path / "draws.nc"
     file.write_text("x", encoding="utf-8")
     with pytest.raises(ModelError, match=r"draws.nc' is a file: expected a folder"):
-        open_checkpoint(file, SETTINGS)
+        read(file, SETTINGS)
     with pytest.raises(ModelError, match=INSIDE_FILE):
-        open_checkpoint(file / "inside", SETTINGS)
+        read(file / "inside", SETTINGS)
 
 
 @pytest.mark.skipif(getattr(os, "geteuid", lambda: 0)() == 0, reason="root may write anywhere")
 def test_a_folder_that_is_read_only_is_refused(tmp_path):
     tmp_path.chmod(0o500)
     with pytest.raises(ModelError, match=r"cannot be written to \(Permission denied"):
-        open_checkpoint(tmp_path, SETTINGS)
+        read(tmp_path, SETTINGS)
 
 
 def in_another_process(script, *arguments):

@@ -5,6 +5,7 @@ import os
 import platform
 import re
 import unicodedata
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -21,16 +22,21 @@ HOLDER = f"""
 import sys, time
 {WITHOUT_PYMC}
 from pymc_statespace_filters.sampling.checkpoint.checkpoint import open_checkpoint
-held = open_checkpoint(sys.argv[1], {SETTINGS})
-print(flush=True)
-time.sleep(10_000)
+with open_checkpoint(sys.argv[1], {SETTINGS}):
+    print(flush=True)
+    time.sleep(10_000)
 """
+
+
+def open_and_close(folder, settings=SETTINGS):
+    with open_checkpoint(folder, settings):
+        pass
 
 
 def opens(folder):
     """Whether the folder is free."""
     try:
-        open_checkpoint(folder, SETTINGS).close()
+        open_and_close(folder)
     except ModelError:
         return False
     return True
@@ -40,7 +46,7 @@ def test_a_folder_is_of_one_process_at_a_time_and_free_when_that_is_killed(tmp_p
     with python("-c", HOLDER, tmp_path) as process:
         process.stdout.readline()
         with pytest.raises(ModelError) as caught:
-            open_checkpoint(tmp_path, SETTINGS)
+            open_and_close(tmp_path)
         assert str(caught.value) == (
             f"{tmp_path} is in use by process {process.pid} on {platform.node()}: wait for its end "
             "or give another path"
@@ -51,14 +57,14 @@ def test_a_folder_is_of_one_process_at_a_time_and_free_when_that_is_killed(tmp_p
 def test_a_folder_is_one_checkpoint_at_a_time_in_a_process(tmp_path):
     with open_checkpoint(tmp_path, SETTINGS):
         with pytest.raises(ModelError, match=f"is in use by process {os.getpid()} on"):
-            open_checkpoint(tmp_path, SETTINGS)
+            open_and_close(tmp_path)
     assert opens(tmp_path)
 
 
 def test_a_run_that_is_refused_frees_the_folder(tmp_path):
     assert opens(tmp_path)
     with pytest.raises(DataMismatchError):
-        open_checkpoint(tmp_path, {"draws": 5})
+        open_and_close(tmp_path, {"draws": 5})
     assert opens(tmp_path)
 
 
@@ -77,7 +83,8 @@ def test_a_fork_does_not_free_the_folder_of_its_parent(tmp_path):
 @pytest.mark.parametrize("ends", [True, False])
 def test_an_owner_on_another_computer_is_waited_for(tmp_path, monkeypatch, ends):
     """A server keeps the lock of a computer that has failed for a while."""
-    held = open_checkpoint(tmp_path, SETTINGS)
+    held = ExitStack()
+    held.enter_context(open_checkpoint(tmp_path, SETTINGS))
     (tmp_path / "run.owner").write_text("process 12 on node7", encoding="utf-8")
     waited, acquire = [], FileLock.acquire
 
@@ -92,7 +99,7 @@ def test_an_owner_on_another_computer_is_waited_for(tmp_path, monkeypatch, ends)
         assert opens(tmp_path)
     else:
         with pytest.raises(ModelError, match="is in use by process 12 on node7: wait for its end"):
-            open_checkpoint(tmp_path, SETTINGS)
+            open_and_close(tmp_path)
     assert waited == [120.0]
 
 
@@ -104,13 +111,14 @@ def test_without_locks_no_second_process_writes_over_what_the_first_has_stored(
         raise OSError(number, "no locks here")
 
     monkeypatch.setattr(FileLock, "acquire", unknown)
-    one, other = (open_checkpoint(tmp_path, SETTINGS) for _ in range(2))
-    one.append("chain 0", {"x": np.arange(3)}, {})
-    for key in ("chain 0", "chain 1"):
-        with pytest.raises(CheckpointError, match="another process has written to this file"):
-            other.append(key, {"x": np.arange(3)}, {})
-    one.append("chain 0", {"x": np.arange(3, 5)}, {})
-    found = open_checkpoint(tmp_path, SETTINGS).read("chain 0")
+    with open_checkpoint(tmp_path, SETTINGS) as one, open_checkpoint(tmp_path, SETTINGS) as other:
+        one.append("chain 0", {"x": np.arange(3)}, {})
+        for key in ("chain 0", "chain 1"):
+            with pytest.raises(CheckpointError, match="another process has written to this file"):
+                other.append(key, {"x": np.arange(3)}, {})
+        one.append("chain 0", {"x": np.arange(3, 5)}, {})
+    with open_checkpoint(tmp_path, SETTINGS) as again:
+        found = again.read("chain 0")
     np.testing.assert_array_equal(found.draws["x"], np.arange(5))
 
 

@@ -8,15 +8,13 @@ import json
 import os
 import re
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, Self
-
-from filelock import FileLock
+from typing import Any
 
 from ...errors import DataMismatchError, ModelError
-from .arrays import Arrays, Stored, encoded
 from .lock import locked
 from .record_file import RecordFile, header_of
 
@@ -26,63 +24,9 @@ _CURE = "delete the folder or give another path"
 _MAX_READABLE = 40  # characters of a name
 
 
-class Checkpoint:
-    """An open checkpoint, made by `open_checkpoint`; a context manager that releases the folder.
-
-    What is stored has a key: ``chain 0``, for example.
-    """
-
-    def __init__(self, records: RecordFile, lock: FileLock):
-        self._records, self._lock = records, lock
-
-    def read(self, key: str) -> Stored | None:
-        """All draws under a key, and the last state; None if there is nothing.
-
-        Raises
-        ------
-        CheckpointError
-            If the file cannot be read, or was damaged since it was opened.
-        """
-        return self._records.read(key) if key in self._records else None
-
-    def append(self, key: str, draws: Arrays, state: Arrays) -> None:
-        """Write one record; when this returns, it is on the disk.
-
-        Parameters
-        ----------
-        key : str
-        draws : mapping of str to ndarray, shape (new draws, ...)
-            The draws since the last record, under the same names each time; numbers or booleans.
-        state : mapping of str to ndarray
-            The whole state after them.
-
-        Raises
-        ------
-        CheckpointError
-            If the record cannot be written, for example because the disk is full. It is then not
-            there, and those before it are.
-        ValueError
-            If an array has Python objects.
-        """
-        self._records.append(encoded(key, draws, state))
-
-    def append_encoded(self, content: bytes) -> None:
-        """Write a record that another rank has sent, made by `encoded`."""
-        self._records.append(content)
-
-    def close(self) -> None:
-        """Release the folder."""
-        self._lock.release()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-def open_checkpoint(path: str | os.PathLike, settings: Mapping[str, Any]) -> Checkpoint:
-    """Open a checkpoint, or begin one where there is none.
+@contextmanager
+def open_checkpoint(path: str | os.PathLike, settings: Mapping[str, Any]) -> Iterator[RecordFile]:
+    """Open a checkpoint, or begin one where there is none; its folder is locked for the block.
 
     Parameters
     ----------
@@ -91,9 +35,10 @@ def open_checkpoint(path: str | os.PathLike, settings: Mapping[str, Any]) -> Che
     settings : mapping of str to JSON values
         All that the draws depend on: arguments, and fingerprints of model and data.
 
-    Returns
-    -------
-    Checkpoint
+    Yields
+    ------
+    RecordFile
+        Keys are ``chain 0``, for example.
 
     Raises
     ------
@@ -118,16 +63,21 @@ def open_checkpoint(path: str | os.PathLike, settings: Mapping[str, Any]) -> Che
     >>> folder.cleanup()
     """
     folder, header = Path(path).absolute(), _canonical(dict(settings))
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = locked(folder)
-        try:
+    with ExitStack() as stack:
+        with _named_errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            stack.callback(locked(folder).release)
             if (folder / _FILE).exists():
                 _check_same(folder, json.loads(header))
-            return Checkpoint(RecordFile(folder / _FILE, header), lock)
-        except BaseException:
-            lock.release()
-            raise
+            records = RecordFile(folder / _FILE, header)
+        yield records
+
+
+@contextmanager
+def _named_errors(folder: Path) -> Iterator[None]:
+    """Say of an error of the file system what to do about it."""
+    try:
+        yield
     except FileExistsError as error:  # on Windows, also of a folder above
         raise ModelError(f"checkpoint={error.filename!r} is a file: expected a folder") from None
     except OSError as error:

@@ -20,7 +20,7 @@ from threading import RLock
 from typing import BinaryIO, NamedTuple
 
 from ...errors import CheckpointError, CheckpointWarning
-from .arrays import Stored, decoded, encoded, joined
+from .arrays import Arrays, Stored, decoded, encoded, joined
 
 _FORMAT, _VERSION = b"pymc_statespace_filters checkpoint ", b"3\n"
 _FRAME = struct.Struct("<QI")  # length and CRC-32; a cryptographic hash would be most of the cost
@@ -81,23 +81,34 @@ class RecordFile:
         self.path, self._header, self._lock = path, header, RLock()
         self._index = self._opened() if path.exists() else self._begun(())
 
-    def __contains__(self, key: str) -> bool:
-        return key in self._index.places
+    def append(self, key: str, draws: Arrays, state: Arrays) -> None:
+        """Write one record; when this returns, it is on the disk.
 
-    def append(self, content: bytes) -> None:
-        """Write a record made by `encoded`; when this returns, it is on the disk.
+        Parameters
+        ----------
+        key : str
+        draws : mapping of str to ndarray, shape (new draws, ...)
+            The draws since the last record, under the same names each time; numbers or booleans.
+        state : mapping of str to ndarray
+            The whole state after them.
 
         Raises
         ------
         CheckpointError
             If it cannot be written, for example because the disk is full: it is then not there, and
             those before it are. Or if the file is not as this process has left it.
+        ValueError
+            If an array has Python objects.
         """
+        self.append_encoded(encoded(key, draws, state))
+
+    def append_encoded(self, content: bytes) -> None:
+        """Write a record made by `encoded`, as another rank sends it."""
         with self._lock, self._named_errors("written"):
             index = self._index
             if index.old_states > _MAX_OLD_STATES + index.size - index.old_states:
                 self._index = index = self._begun(
-                    encoded(key, *self.read(key)) for key in index.places
+                    encoded(key, *joined(self._records(key))) for key in index.places
                 )
             # Opened anew: a file on a network is then as others have left it.
             with open(self.path, "r+b") as file:
@@ -115,8 +126,8 @@ class RecordFile:
                     raise
                 index.add(content)
 
-    def read(self, key: str) -> Stored:
-        """The draws in all records of a key, and the last state; nothing if there are none.
+    def read(self, key: str) -> Stored | None:
+        """The draws in all records of a key, and the last state; None if there are none.
 
         Raises
         ------
@@ -124,11 +135,11 @@ class RecordFile:
             If the file cannot be read, or was damaged since it was opened.
         """
         with self._lock, self._named_errors("read"):
-            return joined(self._records(key))
+            return joined(self._records(key)) if key in self._index.places else None
 
     def _records(self, key: str) -> Iterator[Stored]:
         with open(self.path, "rb") as file:
-            for place in self._index.places.get(key, ()):
+            for place in self._index.places[key]:
                 file.seek(place.start)
                 content = _next_content(file, self._index.salt_of(place.number))
                 if content is None:

@@ -11,7 +11,7 @@ from xarray import DataTree
 from ...parallel.communicator import Communicator
 from ...parallel.signals import unless_interrupted
 from ..checkpoint.arrays import Stored
-from ..checkpoint.checkpoint import Checkpoint
+from ..checkpoint.record_file import RecordFile
 from ..kernel.state import ChainState, Draws
 from ..output.convergence import Convergence, convergence
 from ..output.facts import of_model
@@ -76,7 +76,7 @@ class ModelTask:
         check_no_generators(model)
         self.model, self.request, self.name = model, request, name
         self._group = group
-        self.checkpoint: Checkpoint | None = None
+        self.checkpoint: RecordFile | None = None
         self.population: np.ndarray | None = None
         self._level = -np.inf  # median log-density of the points of the search for starts
         self._is_noisy = False  # and whether too much noise there has been named

@@ -9,7 +9,7 @@ from pymc.model import Model
 from ...errors import ModelError
 from ...facts import tell
 from ...student_mixture import standardised
-from ..checkpoint.checkpoint import Checkpoint
+from ..checkpoint.record_file import RecordFile
 from ..kernel.independence import no_mixture
 from ..kernel.proposal_mixture import fitted_mixture, improved_mixture, warmup_parts
 from ..kernel.state import Draws
@@ -117,7 +117,7 @@ def search_population(
     model: Model,
     target: Target,
     request: SamplingRequest,
-    checkpoint: Checkpoint | None,
+    checkpoint: RecordFile | None,
     begin: str,
     *,
     progressbar: bool,
