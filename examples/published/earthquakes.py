@@ -6,7 +6,7 @@ Series" (2nd ed., 2016), and shipped by several packages. The chain starts from 
 distribution.
 
 The evidence of two, three and four regimes, which they do not print, is estimated twice: by bridge
-sampling from draws that keep the means in order, with a Potential that counts the other orders, and
+sampling from draws that keep the means in order, with `exchangeable`, which counts the others, and
 by sequential Monte Carlo from a prior in which the regimes have any order. That of two regimes is
 also an integral over four parameters, by quadrature.
 """
@@ -19,7 +19,7 @@ import pymc as pm
 import pytensor.tensor as pt
 from comparison import Comparison, Study, cpu_seconds, table
 from scipy.optimize import minimize
-from scipy.special import gammaln, roots_legendre
+from scipy.special import roots_legendre
 from scipy.stats import beta, gamma, poisson
 
 import pymc_statespace_filters as psf
@@ -77,8 +77,6 @@ def with_priors(n: int, *, is_ordered: bool) -> pm.Model:
     with pm.Model() as model:
         P = pm.Dirichlet("P", 1.0 + 8.0 * np.eye(n))
         means = pm.Gamma("means", mu=20, sigma=10, shape=n, **(order if is_ordered else {}))
-        if is_ordered:
-            pm.Potential("orders", pt.constant(gammaln(n + 1.0)))
         psf.StateSpace(
             "counts", chain(n), psf.FiniteStateFilter(), params={"P": P, "means": means},
             observed=RECORD[["count"]].to_numpy(float), steps=STEPS,
@@ -91,7 +89,9 @@ def evidences(n: int) -> list[Comparison]:
     quiet = {"progressbar": False}
     with with_priors(n, is_ordered=True):
         idata = psf.sample(1000, random_seed=1, **quiet)
-        found = psf.estimate_evidence(idata, estimators=("bridge",), random_seed=2, **quiet)
+        found = psf.estimate_evidence(
+            idata, estimators=("bridge",), exchangeable=["means", "P"], random_seed=2, **quiet
+        )
     bridge = found["bridge"].log_evidence, found["bridge"].se
     with with_priors(n, is_ordered=False):
         attrs = psf.sample_smc(PARTICLES[n], random_seed=3, **quiet).attrs

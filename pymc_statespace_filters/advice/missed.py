@@ -26,7 +26,7 @@ def _(fact: PartsOfPosterior) -> list[str]:
 
     Populations fill their tails otherwise, and have a look of their own.
     """
-    if (known := stored(fact.idata)) is not None:
+    if not fact.are_sorted and (known := stored(fact.idata)) is not None:
         return known
     posterior = fact.posterior
     if are_populations(fact.idata) or posterior.log_density.size < _LEAST_DRAWS:

@@ -45,6 +45,7 @@ def chib_jeliazkov(
     *,
     n_proposals: int | None = None,
     n_blocks: int | None = None,
+    exchangeable: Any = None,
     random_seed: int | np.random.Generator | None = None,
     extend_inferencedata: bool = True,
     progressbar: bool = True,
@@ -71,6 +72,8 @@ def chib_jeliazkov(
         Number of blocks of neighbouring parameters whose posterior ordinates are estimated in
         turn. The default is one block; with ten parameters or more, and a predicted error above
         0.1 nats for one block, it is blocks of about ten.
+    exchangeable : str or list, optional
+        As for `estimate_evidence`.
     random_seed : int or numpy.random.Generator, optional
         Seed of the proposals and of the noise of their likelihoods.
     extend_inferencedata : bool
@@ -108,8 +111,8 @@ def chib_jeliazkov(
     -----
     EvidenceWarning
         If the estimate may be unreliable: few terms dominate a mean, the chains disagree, a prior
-        is improper or not normalised, exchangeable labels lack orders, or part of the posterior
-        lies at the stability limit of Euler-Maruyama steps.
+        is improper or not normalised, labels may be exchanged and are not `exchangeable`, or part
+        of the posterior lies at the stability limit of Euler-Maruyama steps.
 
     Examples
     --------
@@ -133,6 +136,7 @@ def chib_jeliazkov(
             idata,
             model,
             [ChibJeliazkov(n_proposals, n_blocks)],
+            exchangeable=exchangeable,
             random_seed=random_seed,
             extend_inferencedata=extend_inferencedata,
             progressbar=progressbar,
@@ -190,6 +194,7 @@ def estimate_evidence(
     filter: Filter | None = None,
     estimators: str | Estimator | Iterable[str | Estimator] | None = None,
     target_se: float = 0.05,
+    exchangeable: Any = None,
     random_seed: int | np.random.Generator | None = None,
     extend_inferencedata: bool = True,
     progressbar: bool = True,
@@ -221,6 +226,14 @@ def estimate_evidence(
         with about 1000 evaluations and double them as long as this helps, up to at most 20 000. An
         `Estimator` with its own ``target_se`` or ``n_proposals`` keeps it. The part of the error
         that is due to the draws is reduced by more draws alone.
+    exchangeable : str or list, optional
+        The free variables with labels that may be exchanged, as those of K regimes:
+        ``["mean", "P"]``. They are along one or more axes of a variable; a tuple
+        ``("low", "high")`` has scalars of one label each, and a scalar is the share w of the first
+        of two, of which the other one has 1 - w. All K! orders are then counted, whether the draws
+        visit all of them, a transform keeps one, or the chains stay in one. ``()`` says that there
+        are none. Without the argument, an evidence of labels that the density lets exchange is
+        doubted.
     random_seed : int or numpy.random.Generator, optional
         Seed. Each estimator gets its own stream, independent of which others run.
     extend_inferencedata : bool
@@ -304,6 +317,7 @@ def estimate_evidence(
             model,
             selected,
             filter=filter,
+            exchangeable=exchangeable,
             random_seed=random_seed,
             extend_inferencedata=extend_inferencedata,
             progressbar=progressbar,

@@ -1,8 +1,11 @@
-"""Labels that may be exchanged, as those of regimes, and whether all their orders are counted.
+"""Labels that may be exchanged, as those of regimes, and an evidence that counts all their orders.
 
-If the density of a model stays the same when K labels are permuted in all parameters that have
-them, its posterior has K! equal parts. Draws that stay in one part, and an ordering transform,
-which leaves one part of the prior, lack ln K! of the evidence.
+If the density of a model stays the same when K labels are permuted in all variables that have them,
+its posterior has K! equal parts. Draws that stay in one part, and an ordering transform, which
+leaves one part of the prior, lack ln K! of the evidence. Where labels are declared, every draw is
+brought into one order, the density is zero in all others, and ln K! is added: that is the evidence
+whichever parts the draws have visited. Where they are not, exchanges of labels at a few draws tell
+that they should be.
 
 S. Chib, "Marginal likelihood from the Gibbs output", J. Am. Stat. Assoc. 90 (1995), whose estimate
 was corrected so by R. M. Neal, "Erroneous results in 'Marginal likelihood from the Gibbs output'"
@@ -10,172 +13,172 @@ was corrected so by R. M. Neal, "Erroneous results in 'Marginal likelihood from 
 models", Econometrics Journal 7 (2004).
 """
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pymc as pm
 import xarray as xr
-from numpy.typing import NDArray
 from pytensor.graph.basic import Variable, equal_computations
-from pytensor.graph.traversal import ancestors
 from pytensor.tensor.random.type import RandomType
-from scipy.optimize import linear_sum_assignment
-from scipy.sparse.csgraph import connected_components
-from scipy.special import gammaln
 
-from ..pymc_model.density import ConstrainedDensity
+from ..errors import ModelError
+from ..pymc_model.density import ModelDensity
+from ..pymc_model.posterior_draws import unconstrained
 from ..pymc_model.prior import is_restricted
+from .labels import Array, Key, Labels, are_symmetric, placements
+from .posterior import Posterior
 
-MOST_LABELS, MOST_PLACES = 8, 6
-N_POINTS, N_SEEDS = 4, 8  # draws at which densities are compared; estimates of a noisy one
-ROUNDING, MAX_ERROR = 1e-7, 1.0  # relative; in nats, of a noisy difference
-N_ORDERED = 400  # draws whose order is found
-N_RELABELLED = 5  # rounds in which orders and what labels have in common are found in turn
-RARELY = 0.1  # of the share that a label would have if all orders were visited equally
-
-Array = NDArray[np.float64]
-Draws = Mapping[str, Array]
+MOST_LABELS, MOST_PLACES = 8, 6  # of labels that are not declared
+RARELY = 0.1  # of the share of an order, if all were visited equally
 
 
-class Axis(NamedTuple):
-    """Labels along an axis of a free variable."""
+class OneOrder:
+    """Draws and density of declared labels in one order: ascending in the first variable of them.
 
-    name: str
-    number: int
+    Parameters
+    ----------
+    exchangeable : str or iterable
+        As of `estimate_evidence`.
+    density : ModelDensity
+    idata : xarray.DataTree
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The variables that have the labels."""
-        return (self.name,)
+    Attributes
+    ----------
+    labels : Labels
+    ordered : list of str
+        The variables that a transform keeps in order, so that nothing needs to be sorted.
 
-    @property
-    def parts(self) -> tuple["Axis", ...]:
-        """What no other labels may have."""
-        return (self,)
-
-    def permuted(self, points: Draws, order: NDArray[np.int64]) -> Draws:
-        """The points with other labels."""
-        changed = np.take(points[self.name], order, axis=self.number + 1)
-        return {**points, self.name: changed}
-
-
-class Scalars(NamedTuple):
-    """Labels of scalar variables, one for each, in this order."""
-
-    names: tuple[str, ...]
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """What no other labels may have."""
-        return self.names
-
-    def permuted(self, points: Draws, order: NDArray[np.int64]) -> Draws:
-        """The points with other labels."""
-        changed = {name: points[self.names[i]] for name, i in zip(self.names, order, strict=True)}
-        return {**points, **changed}
-
-
-class Share(NamedTuple):
-    """The share w of the first of two labels; the other one has 1 - w."""
-
-    name: str
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The variable that has the labels."""
-        return (self.name,)
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """What no other labels may have."""
-        return (self.name,)
-
-    def permuted(self, points: Draws, order: NDArray[np.int64]) -> Draws:
-        """The points with other labels."""
-        share = points[self.name]
-        return {**points, self.name: share if order[0] == 0 else 1.0 - share}
-
-
-type Place = Axis | Scalars | Share
-
-
-@dataclass(frozen=True)
-class Labels:
-    """K labels that may be exchanged, in these places.
-
-    ``lacking`` is the logarithm of the number of parts of the posterior over those that the draws
-    visit; ``ordered`` are the variables of which a transform leaves one part of the prior.
+    Raises
+    ------
+    ModelError
+        If the argument is invalid, or the density changes where labels are exchanged.
     """
 
-    count: int
-    places: tuple[Place, ...]
-    lacking: float
-    ordered: tuple[str, ...]
+    def __init__(
+        self, exchangeable: Any, density: ModelDensity, idata: xr.DataTree, rng: np.random.Generator
+    ) -> None:
+        model, values = density.model, _flat_values(density.model, idata)
+        given = [exchangeable] if isinstance(exchangeable, str) else list(exchangeable)
+        tried = _declared(given, model)
+        self.ordered = [
+            name
+            for name in tried[0].axes
+            if (np.diff(tried[0].of_labels(name, values)) > 0.0).all()
+            and is_restricted(model[name], model)
+        ]
+        is_symmetric = are_symmetric(tried, density, values, rng, as_they_are=bool(self.ordered))
+        if not is_symmetric.any():
+            raise ModelError(
+                f"exchangeable must name labels whose exchange leaves the density as it is, got "
+                f"{given}: name all variables that have the labels, and give these one prior"
+            )
+        self.labels = tried[int(is_symmetric.argmax())]
+        self._model, self._values = model, values
+        self._key = self.labels.sorted_by(model)[0]
 
-    @property
-    def names(self) -> list[str]:
-        """Names of the variables that have the labels."""
-        return list(dict.fromkeys(name for place in self.places for name in place.names))
+    def sorted_draws(self, posterior: Posterior) -> Posterior:
+        """The posterior with every draw in this order."""
+        if self.ordered:
+            return posterior
+        order = np.argsort(self.labels.of_labels(self._key, self._values), axis=1)
+        draws = unconstrained(self._model, self.labels.permuted(self._values, order))
+        return replace(posterior, draws=draws.reshape(posterior.draws.shape))
+
+    def restricted(self, posterior: Posterior) -> Posterior:
+        """The posterior with a density of zero in other orders."""
+        if self.ordered:
+            return posterior
+        start, first, numbers = self._model.initial_point(), 0, {}
+        for rv in self._model.free_RVs:
+            like = start[self._model.rvs_to_values[rv].name]
+            numbers[rv.name] = first + np.arange(like.size).reshape(1, *like.shape)
+            first += like.size
+        [columns] = self.labels.of_labels(self._key, numbers)
+
+        def evaluate(x: Array, rng: np.random.Generator) -> Array:
+            found = np.full(len(x), -np.inf)
+            is_sorted = (np.diff(x[:, columns], axis=1) > 0.0).all(axis=1)
+            found[is_sorted] = posterior.evaluate(x[is_sorted], rng)
+            return found
+
+        return replace(posterior, evaluate=evaluate)
 
 
-def exchangeable_labels(
-    model: pm.Model, idata: xr.DataTree, log_density: Array, rng: np.random.Generator
-) -> list[Labels]:
-    """Find the labels of a model by permutations at some draws (chain, draw) of its posterior."""
-    posterior = idata["posterior"].to_dataset()
-    draws = {
-        rv.name: _flat(posterior[rv.name].transpose("chain", "draw", ...).values)
-        for rv in model.free_RVs
-    }
-    by_count = _places_by_count(draws, _alike_scalars(model))
-    if not by_count:
-        return []
-    test = _InvarianceTest(model, draws, rng)
-    best, taken, found = int(np.argmax(log_density)), set[Axis | str](), list[Labels]()
-    for count in sorted(by_count, reverse=True):  # two of three scalars are no labels of their own
-        for places in _invariant_places(test, by_count[count], count, taken):
-            found.append(_found(model, draws, count, places, best))
+def undeclared_labels(
+    density: ModelDensity, idata: xr.DataTree, rng: np.random.Generator
+) -> Iterator[str]:
+    """Yield what is doubtful of labels that may be exchanged, unless the draws visit all orders."""
+    model, values = density.model, _flat_values(density.model, idata)
+    taken: set[str] = set()
+    possible = _possible_keys(model, values)
+    for count in sorted(possible, reverse=True):  # two of three scalars are no labels of their own
+        keys = possible[count]
+        sizes = range(1, len(keys) + 1) if len(keys) <= MOST_PLACES else [len(keys)]
+        subsets = [some for size in sizes for some in combinations(keys, size)]
+        tried = [one for some in subsets for one in placements(some, count, model)]
+        for i in np.flatnonzero(are_symmetric(tried, density, values, rng)):
+            if taken & (one := tried[i]).names:
+                continue
+            taken |= one.names
+            if not all(_has_all_orders(one.of_labels(key, values)) for key in one.keys):
+                yield (
+                    f"the {count} labels of {', '.join(sorted(one.names))} may be exchanged, and "
+                    f"draws that do not visit all orders of them lack up to ln {count}! = "
+                    f"{one.log_orders:.3f} of the log-evidence: give exchangeable={one.keys}, "
+                    "which counts them all"
+                )
+
+
+def _flat_values(model: pm.Model, idata: xr.DataTree) -> dict[str, Array]:
+    """The draws of the free variables, one after the other."""
+    posterior = idata["posterior"].to_dataset().transpose("chain", "draw", ...)
+    return {rv.name: np.concatenate(posterior[rv.name].values) for rv in model.free_RVs}
+
+
+def _declared(given: Sequence[Key], model: pm.Model) -> list[Labels]:
+    """All that the names may mean: a matrix may have labels along one axis or both."""
+    free = [rv.name for rv in model.free_RVs]
+    names = {name for key in given for name in ((key,) if isinstance(key, str) else key)}
+    if unknown := names - set(free):
+        raise ModelError(
+            f"exchangeable must name free variables of the model, {free}, got {sorted(unknown)}"
+        )
+    lengths = [len(key) if isinstance(key, tuple) else model[key].shape.eval() for key in given]
+    counts = set(np.concatenate([np.ravel(one) for one in lengths]).astype(int).tolist()) - {1}
+    found = [one for count in sorted(counts) for one in placements(given, count, model)]
+    if not found:
+        raise ModelError(
+            "exchangeable must name a vector, or a tuple of scalars, and other variables with as "
+            f"many labels: along an axis, or the share of the first of two; got {given}"
+        )
     return found
 
 
-def uncounted_orders(model: pm.Model, found: Sequence[Labels]) -> Iterator[str]:
-    """Yield what the evidence lacks, unless constant Potentials of the model count it."""
-    total = sum(one.lacking for one in found)
-    if abs(total - _constant_potentials(model)) < 0.01:
-        return
-    for one in found:
-        if one.lacking > 0.0:
-            names, orders = ", ".join(one.names), np.exp(one.lacking)
-            why = (
-                "a transform leaves one order of them in the prior"
-                if one.ordered
-                else "the draws do not visit all orders of them"
-            )
-            yield (
-                f"the {one.count} labels of {names} may be exchanged and {why}, so that the "
-                f"log-evidence lacks ln {orders:.0f} = {one.lacking:.3f}: add it, or give the "
-                f"model pm.Potential('orders', pm.math.log({orders:.1f})) before it is sampled"
-            )
-
-
-def _flat(values: Array) -> Array:
-    """Draws (chain, draw, ...) one after the other."""
-    return values.reshape(-1, *values.shape[2:]).astype(np.float64)
-
-
-def _alike_scalars(model: pm.Model) -> list[list[str]]:
-    """Names of scalar variables of the same prior distribution, at least two."""
-    groups: list[list[Variable]] = []
-    for rv in model.free_RVs:
-        alike = [group for group in groups if _have_one_prior(group[0], rv)]
-        if alike:
-            alike[0].append(rv)
-        elif rv.ndim == 0:
-            groups.append([rv])
-    return [[str(rv.name) for rv in group] for group in groups if len(group) > 1]
+def _possible_keys(model: pm.Model, values: Mapping[str, Array]) -> dict[int, list[Key]]:
+    """The variables that may have labels, by the number of these."""
+    found: dict[int, list[Key]] = {}
+    scalars = [rv for rv in model.free_RVs if rv.ndim == 0]
+    for name, of_name in values.items():
+        for length in {n for n in of_name.shape[1:] if 2 <= n <= MOST_LABELS}:
+            found.setdefault(length, []).append(name)
+    while scalars:
+        alike = tuple(rv.name for rv in scalars if _have_one_prior(scalars[0], rv))
+        scalars = [rv for rv in scalars if rv.name not in alike]
+        for count in range(2, min(len(alike), MOST_LABELS) + 1):
+            groups = list(combinations(alike, count))
+            if len(groups) + len(found.get(count, [])) <= MOST_PLACES:
+                found.setdefault(count, []).extend(groups)
+    if 2 in found:
+        found[2] += [
+            name
+            for name, of_name in values.items()
+            if of_name.ndim == 1 and ((of_name > 0.0) & (of_name < 1.0)).all()
+        ][: MOST_PLACES - len(found[2])]
+    return found
 
 
 def _have_one_prior(one: Variable, other: Variable) -> bool:
@@ -188,147 +191,8 @@ def _have_one_prior(one: Variable, other: Variable) -> bool:
     return len(first) == len(second) and equal_computations(first, second)
 
 
-def _places_by_count(draws: Draws, alike: Sequence[Sequence[str]]) -> dict[int, list[Place]]:
-    """Where labels may be, by their number."""
-    found: dict[int, list[Place]] = {}
-    for name, values in draws.items():
-        for number, length in enumerate(values.shape[1:]):
-            if 2 <= length <= MOST_LABELS:
-                found.setdefault(length, []).append(Axis(name, number))
-    for names in alike:
-        for count in range(2, min(len(names), MOST_LABELS) + 1):
-            groups = [Scalars(some) for some in combinations(names, count)]
-            if len(groups) + len(found.get(count, [])) <= MOST_PLACES:
-                found.setdefault(count, []).extend(groups)
-    shares = [Share(name) for name, values in draws.items() if _is_share(values)]
-    if 2 in found and len(shares) + len(found[2]) <= MOST_PLACES:
-        found[2].extend(shares)
-    return found
-
-
-def _is_share(values: Array) -> bool:
-    return values.ndim == 1 and bool(((values > 0.0) & (values < 1.0)).all())
-
-
-def _invariant_places(
-    test: "_InvarianceTest", places: Sequence[Place], count: int, taken: set[Axis | str]
-) -> Iterator[tuple[Place, ...]]:
-    """Yield the smallest disjoint sets of places whose labels may be exchanged, and take them.
-
-    Of many places only all together are tried.
-    """
-    sizes = range(1, len(places) + 1) if len(places) <= MOST_PLACES else [len(places)]
-    for size in sizes:
-        for some in combinations(places, size):
-            parts = [part for place in some for part in place.parts]
-            if len(set(parts)) < len(parts) or taken & set(parts):
-                continue
-            if test.is_invariant(some, count):
-                taken |= set(parts)
-                yield some
-
-
-class _InvarianceTest:
-    """Whether permutations leave the density the same at some draws.
-
-    The density is that of the parameters as they are, without transforms: those may keep an order.
-    """
-
-    def __init__(self, model: pm.Model, draws: Draws, rng: np.random.Generator) -> None:
-        example = {name: values[0] for name, values in draws.items()}
-        self._density = ConstrainedDensity(model, example)
-        n_draws = len(next(iter(draws.values())))
-        chosen = rng.choice(n_draws, N_POINTS, replace=False)
-        self._points = {name: values[chosen] for name, values in draws.items()}
-        self._rng = rng
-        self._before = self._values(self._points)
-
-    def is_invariant(self, places: Sequence[Place], count: int) -> bool:
-        """Whether all permutations of the labels do: those of two neighbours generate them."""
-        return all(self._is_same_with(places, count, i) for i in range(count - 1))
-
-    def _is_same_with(self, places: Sequence[Place], count: int, label: int) -> bool:
-        """Whether the label and the next one may be exchanged."""
-        order = np.arange(count)
-        order[[label, label + 1]] = label + 1, label
-        points: Draws = self._points
-        for place in places:
-            points = place.permuted(points, order)
-        with np.errstate(invalid="ignore"):
-            change = self._values(points) - self._before
-        if not np.isfinite(change).all():
-            return False
-        error = change.std(axis=0, ddof=1) / len(change) ** 0.5 if len(change) > 1 else 0.0
-        rounding = ROUNDING * (10.0 + np.abs(self._before).max())
-        is_small = np.abs(change.mean(axis=0)) <= rounding + 4.0 * error
-        return bool(is_small.all() and np.max(error) <= MAX_ERROR)
-
-    def _values(self, points: Draws) -> Array:
-        """Log-densities of the points, a row for each noise."""
-        x = np.concatenate([values.reshape(N_POINTS, -1) for values in points.values()], axis=1)
-        n_noises = len(self._density.seed_names)
-        n_rows = N_SEEDS if n_noises else 1
-        seeds = self._rng.integers(np.iinfo(np.int64).max, size=(n_rows * N_POINTS, n_noises))
-        return self._density.evaluate(np.tile(x, (n_rows, 1)), seeds).reshape(n_rows, N_POINTS)
-
-
-def _found(
-    model: pm.Model, draws: Draws, count: int, places: tuple[Place, ...], best: int
-) -> Labels:
-    axes = [place for place in places if isinstance(place, Axis)]
-    ordered = tuple(axis.name for axis in axes if _keeps_order(model, draws, axis))
-    visited = 0.0 if ordered else _log_visited(_features(draws, places), best)
-    return Labels(count, places, float(gammaln(count + 1)) - visited, ordered)
-
-
-def _keeps_order(model: pm.Model, draws: Draws, axis: Axis) -> bool:
-    """Whether a transform keeps the draws in ascending order along an axis."""
-    is_sorted = (np.diff(draws[axis.name], axis=axis.number + 1) > 0.0).all()
-    return bool(is_sorted and is_restricted(model[axis.name], model))
-
-
-def _features(draws: Draws, places: Sequence[Place]) -> Array:
-    """What each draw says of each label, (draw, label, feature): of a matrix the diagonal."""
-    axes = [place for place in places if isinstance(place, Axis)]
-    columns = [
-        np.stack([draws[name] for name in place.names], axis=1)[:, :, np.newaxis]
-        for place in places
-        if isinstance(place, Scalars)
-    ]
-    shares = [draws[place.name] for place in places if isinstance(place, Share)]
-    columns += [np.stack([share, 1.0 - share], axis=1)[:, :, np.newaxis] for share in shares]
-    for name in dict.fromkeys(axis.name for axis in axes):
-        numbers = [axis.number + 1 for axis in axes if axis.name == name]
-        values = np.moveaxis(draws[name], numbers, range(1, 1 + len(numbers)))
-        label = np.arange(values.shape[1])
-        diagonal: tuple[Any, ...] = (slice(None), *[label] * len(numbers))
-        own = values[diagonal]
-        columns.append(own.reshape(*own.shape[:2], -1))
-    return np.concatenate(columns, axis=2)
-
-
-def _log_visited(features: Array, best: int) -> float:
-    """Logarithm of the number of orders that the draws visit, told by the draw of most density.
-
-    Labels that ever take each other's place are taken to visit all orders among themselves.
-    """
-    count, reference = features.shape[1], features[best]
-    chosen = features[:: -(-len(features) // N_ORDERED)]
-    scale = features.std(axis=(0, 1))
-    for _ in range(N_RELABELLED):
-        scale = np.where(scale > 0.0, scale, 1.0)
-        distances = (((chosen[:, :, None] - reference) / scale) ** 2).sum(axis=-1)
-        orders = np.array([linear_sum_assignment(one.T)[1] for one in distances])
-        relabelled = np.take_along_axis(chosen, orders[:, :, None], axis=1)
-        # A feature tells labels apart if it varies less within them than between them.
-        reference, scale = relabelled.mean(axis=0), relabelled.std(axis=0).mean(axis=0)
-    share = np.array([(orders == label).mean(axis=0) for label in range(count)])
-    _, group = connected_components(share > RARELY / count, directed=False)
-    return float(gammaln(np.bincount(group) + 1.0).sum())
-
-
-def _constant_potentials(model: pm.Model) -> float:
-    """The sum of the Potentials that depend on no variable of the model."""
-    variables = set(model.basic_RVs)
-    constant = [one for one in model.potentials if not variables & set(ancestors([one]))]
-    return float(sum(one.sum().eval(mode="FAST_COMPILE") for one in constant))
+def _has_all_orders(values: Array) -> bool:
+    """Whether values (n, K) of labels are in every order, and in none of them rarely."""
+    n, count = values.shape
+    _, visits = np.unique(np.argsort(values, axis=1), axis=0, return_counts=True)
+    return len(visits) == math.factorial(count) and visits.min() >= RARELY * n / len(visits)

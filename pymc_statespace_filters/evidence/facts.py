@@ -22,12 +22,16 @@ class FiltersOfDraws(Fact):
 
 @dataclass(frozen=True)
 class PartsOfPosterior(Fact):
-    """Draws that may lack parts of their posterior, if that was not looked at before."""
+    """Draws that may lack parts of their posterior, if that was not looked at before.
+
+    Sorted draws are others than those that were looked at.
+    """
 
     idata: DataTree
     model: Model
     posterior: Posterior
     rng: np.random.Generator
+    are_sorted: bool = False
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from .estimators.maximum_likelihood import N_EVALUATIONS, max_log_likelihood
 from .estimators.protocol import Estimate, Estimator
 from .evidence import Evidence, store_evidence
 from .exact_density import ExactDensity
-from .exchangeable_labels import exchangeable_labels, uncounted_orders
+from .exchangeable_labels import OneOrder, undeclared_labels
 from .facts import CorrectingFilter, FiltersOfDraws, PartsOfPosterior
 from .observed_data import data_fingerprint, observation_count
 from .posterior import Posterior
@@ -53,6 +53,7 @@ def run_estimators(
     estimators: Sequence[Estimator],
     *,
     filter: Filter | None = None,
+    exchangeable: Any = None,
     random_seed: int | np.random.Generator | None,
     extend_inferencedata: bool,
     progressbar: bool,
@@ -86,15 +87,22 @@ def run_estimators(
         """Random numbers of a purpose, independent of which others run."""
         return np.random.default_rng([*entropy, crc32(name.encode())])
 
-    labels = exchangeable_labels(model, idata, posterior.log_density, stream(LABELS))
-    support = Support.of(model, [name for one in labels for name in one.ordered])
+    one_order = OneOrder(exchangeable, density, idata, stream(LABELS)) if exchangeable else None
+    undeclared: list[str] = []
+    if one_order is not None:
+        posterior = one_order.restricted(one_order.sorted_draws(posterior))
+    elif exchangeable is None:
+        undeclared = list(undeclared_labels(density, idata, stream(LABELS)))
+    support = Support.of(model, [] if one_order is None else one_order.ordered)
+    is_sorted = one_order is not None and not one_order.ordered
+    parts = PartsOfPosterior(idata, model, posterior, stream(UNVISITED), is_sorted)
     common = (
         *support.check(),
         *check_discretisation(model, idata, posterior.draws),
         *(sentences(FiltersOfDraws(idata, model)) if exact is None else ()),
         *check_convergence(posterior, idata),
-        *uncounted_orders(model, labels),
-        *sentences(PartsOfPosterior(idata, model, posterior, stream(UNVISITED))),
+        # Draws that miss orders of labels miss modes as well, which is said once.
+        *(undeclared or sentences(parts)),
     )
     posterior = replace(posterior, shared_seed=(*entropy, crc32(SHARED.encode())))
     if are_populations(idata):
@@ -103,6 +111,8 @@ def run_estimators(
         if exact is not None:
             noise = "refreshed" if exact.n_noisy else "none"
             posterior = exact_posterior(posterior, exact, stream(CORRECTION), announce)
+            if one_order is not None:
+                posterior = one_order.restricted(posterior)
             seconds = time.process_time() - began
             draws = posterior.draws.reshape(-1, posterior.draws.shape[-1])
             given = draws, model, exact.filter, seconds, stream(FILTER)
@@ -115,6 +125,12 @@ def run_estimators(
         largest = max_log_likelihood(posterior, rng)
         if exact is None:
             estimates = _where_reached(estimates, posterior, largest.point, rng)
+        if one_order is not None:
+            more = one_order.labels.log_orders
+            estimates = {
+                name: replace(one, log_evidence=one.log_evidence + more)
+                for name, one in estimates.items()
+            }
 
     of_model = _model_fields(model, posterior, support)
     of_model |= {"max_log_likelihood": largest.log_likelihood, "noise": noise}

@@ -4,7 +4,7 @@ The unconstrained space is that of the model's value variables: every free varia
 and vectors and matrices are flattened.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pymc as pm
@@ -13,6 +13,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from pymc.initial_point import make_initial_point_fn
 from pytensor.graph.replace import graph_replace
+from pytensor.tensor.variable import TensorVariable
 
 from ..compiler.native.rows import at_points
 from ..errors import DataMismatchError, ModelError
@@ -154,9 +155,9 @@ def unconstrained_draws(
             raise DataMismatchError(
                 f"{rv.name!r} in idata must have the model's shape {expected}, got {drawn}"
             )
-    unconstrained = _unconstrained(model, _completed(posterior, model))
-    columns = [unconstrained[rv.name].reshape(n_chains, n_draws, -1) for rv in chosen]
-    draws = np.concatenate(columns, axis=-1).astype(np.float64)
+    completed = _completed(posterior, model).transpose("chain", "draw", ...)
+    values = {rv.name: np.concatenate(completed[rv.name].values) for rv in model.free_RVs}
+    draws = unconstrained(model, values, chosen).reshape(n_chains, n_draws, -1)
     outside = int((~np.isfinite(draws).all(axis=-1)).sum())
     if outside:
         raise DataMismatchError(
@@ -167,8 +168,14 @@ def unconstrained_draws(
     return draws
 
 
-def _unconstrained(model: pm.Model, posterior: xr.Dataset) -> dict[str, np.ndarray]:
-    """All draws (chain * draw, ...) of each free variable, as its transform maps them.
+def unconstrained(
+    model: pm.Model,
+    values: Mapping[str, np.ndarray],
+    chosen: Sequence[TensorVariable] = (),
+) -> NDArray[np.float64]:
+    """Points (n, k) from values (n, ...) of all free variables; of some of them, if so ``chosen``.
+
+    What lies outside the support is not finite.
 
     PyMC's ``unconstrain_values`` hands DataArrays to operations that need arrays, such as that of
     `LKJCorr`.
@@ -183,11 +190,12 @@ def _unconstrained(model: pm.Model, posterior: xr.Dataset) -> dict[str, np.ndarr
     batches, results = at_points(symbols, graphs)
     # A single call for all draws does not repay compilation to machine code.
     function = pytensor.function(batches, results, mode="FAST_COMPILE", on_unused_input="ignore")
-    values = []
-    for rv, batch in zip(free, batches, strict=True):
-        drawn = posterior[rv.name].transpose("chain", "draw", ...).values
-        values.append(drawn.reshape(-1, *drawn.shape[2:]).astype(batch.type.dtype))
-    return dict(zip([rv.name for rv in free], function(*values), strict=True))
+    arrays = [
+        values[rv.name].astype(batch.type.dtype) for rv, batch in zip(free, batches, strict=True)
+    ]
+    found = dict(zip(free, function(*arrays), strict=True))
+    columns = [found[rv].reshape(len(arrays[0]), -1) for rv in chosen or free]
+    return np.concatenate(columns, axis=1).astype(np.float64)
 
 
 def _completed(posterior: xr.Dataset, model: pm.Model) -> xr.Dataset:

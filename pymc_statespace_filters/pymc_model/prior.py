@@ -29,11 +29,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Support:
-    """The fields of `Evidence` of the same names."""
+    """The fields of `Evidence` of the same names, and the priors that a transform restricts."""
 
     log_volume: float
     uniform: str
     improper: str
+    restricted: tuple[str, ...]
 
     @classmethod
     def of(cls, model: pm.Model, ordered: Collection[str] = ()) -> "Support":
@@ -42,19 +43,31 @@ class Support:
         A transform may restrict those that are known to be ``ordered``.
         """
         widths = {rv.name: log_widths for rv in model.free_RVs for log_widths in _widths(rv, model)}
-        improper = [
+        restricted = [
             rv.name
             for rv in model.free_RVs
-            if not can_sample(rv, model) or (rv.name not in ordered and is_restricted(rv, model))
+            if rv.name not in ordered and can_sample(rv, model) and is_restricted(rv, model)
         ]
-        return cls(float(sum(widths.values())), ", ".join(widths), ", ".join(improper))
+        improper = [
+            rv.name for rv in model.free_RVs if rv.name in restricted or not can_sample(rv, model)
+        ]
+        volume = float(sum(widths.values()))
+        return cls(volume, ", ".join(widths), ", ".join(improper), tuple(restricted))
 
     def check(self) -> Iterator[str]:
-        """Yield a reason if a prior is improper."""
-        if self.improper:
+        """Yield a reason for each kind of improper priors."""
+        if self.restricted:
             yield (
-                f"the prior of {self.improper} is improper or not normalised, so that the evidence "
-                "depends on the units of the parameters: give them proper priors"
+                f"a transform leaves a part of the prior of {', '.join(self.restricted)}, which is "
+                "not normalised: if it keeps an order of labels that may be exchanged, name all "
+                "variables that have them, as exchangeable=['mean', 'P'], and all orders count; "
+                "otherwise give a prior without it, as pm.Truncated"
+            )
+        others = [one for one in self.improper.split(", ") if one not in self.restricted]
+        if any(others):
+            yield (
+                f"the prior of {', '.join(others)} is improper or not normalised, so that the "
+                "evidence depends on the units of the parameters: give them proper priors"
             )
 
 

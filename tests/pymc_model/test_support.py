@@ -44,5 +44,7 @@ def test_densities_without_an_integral_or_with_another_one():
         pm.LKJCholeskyCov("chol", n=2, eta=1, sd_dist=pm.HalfNormal.dist(1), compute_corr=False)
     support = Support.of(model)
     assert support.improper == "flat, half, walk, field, sorted, positive"
-    (doubt,) = support.check()
-    assert "depends on the units of the parameters: give them proper priors" in doubt
+    of_transforms, of_others = support.check()
+    assert "the prior of sorted, positive, which is not normalised" in of_transforms
+    assert "the prior of flat, half, walk, field is improper" in of_others
+    assert "depends on the units of the parameters: give them proper priors" in of_others

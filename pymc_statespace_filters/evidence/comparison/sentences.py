@@ -106,7 +106,7 @@ def _warnings(evidences: Mapping[str, Evidence]) -> Iterator[str]:
 def _reasons(evidence: Evidence) -> Iterator[str]:
     if evidence.doubts:
         yield evidence.doubts
-    if evidence.improper and "improper" not in evidence.doubts:
+    if evidence.improper and "not normalised" not in evidence.doubts:
         yield f"the prior of {evidence.improper} is improper or not normalised"
     if math.isnan(evidence.se):
         yield "the estimate has no standard error, so that no interval is known"
