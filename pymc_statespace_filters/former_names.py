@@ -1,4 +1,4 @@
-"""Old names, of the package and of arguments: each is an error that says what to use instead."""
+"""Old names, of the package, of estimators and of arguments: errors that say what to use now."""
 
 from collections.abc import Callable
 from functools import wraps
@@ -30,6 +30,13 @@ NAMES = {
     "plot_phase": "has gone: plot a state of idata['smoothed_states'] against another",
     "plot_predictive": 'has gone: use plot_forecast(idata, group="posterior_predictive")',
     "relevance": "has gone: use select_terms",
+}
+
+FORMER_ESTIMATORS = {
+    "laplace": "has gone: use 'bridge' or 'importance', whose errors are known",
+    "prior_monte_carlo": "has gone: use the evidence of sample_smc, which needs no draws",
+    "tempered_smc": "has gone: use the evidence of sample_smc, which needs no draws",
+    "warp_bridge": "has gone: use 'bridge', or 'importance' for skewed posteriors",
 }
 
 _OF_DRAM = "stages stage_scale adaptation adapt_every refresh_noise correlation screen screen_power"

@@ -13,6 +13,7 @@ import xarray as xr
 from ..compiler.native.compilation import COMPILATION
 from ..errors import INSIDE, EvidenceWarning, ModelError
 from ..filters.protocol import Filter
+from ..former_names import FORMER_ESTIMATORS
 from ..parallel.cpu_affinity import cores_set_to
 from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.inspection import given_model
@@ -29,13 +30,6 @@ from .runner import run_estimators
 _BUILT_IN: tuple[Estimator, ...] = (ChibJeliazkov(), Bridge(), Importance())
 DEFAULT = ("chib_jeliazkov", "bridge")
 ESTIMATORS: Mapping[str, Estimator] = {estimator.name: estimator for estimator in _BUILT_IN}
-# Names that were once among them.
-_INSTEAD = {
-    "laplace": "'bridge' or 'importance', whose errors are known",
-    "prior_monte_carlo": "the evidence of sample_smc, which needs no draws",
-    "tempered_smc": "the evidence of sample_smc, which needs no draws",
-    "warp_bridge": "'bridge', or 'importance' for skewed posteriors",
-}
 
 
 @shared_by_ranks
@@ -347,8 +341,8 @@ def _select_estimators(
     entries = [given] if isinstance(given, str | Estimator) else list(given)
     found: dict[str, Estimator] = {}
     for entry in entries:
-        if isinstance(entry, str) and entry in _INSTEAD:
-            raise ModelError(f"the estimator {entry!r} has gone: use {_INSTEAD[entry]}")
+        if isinstance(entry, str) and entry in FORMER_ESTIMATORS:
+            raise ModelError(f"the estimator {entry!r} {FORMER_ESTIMATORS[entry]}")
         estimator = ESTIMATORS.get(entry) if isinstance(entry, str) else entry
         if not isinstance(estimator, Estimator):
             raise ModelError(
