@@ -66,7 +66,7 @@ def microseconds_a_draw(tune: bool, n: int = 200_000) -> float:
         psf.sample_dram,
         chains=1,
         cores=1,
-        kernel=RandomWalkSettings(stages=1),
+        kernel={"stages": 1},
         random_seed=1,
         progressbar=False,
         model=model,
