@@ -116,11 +116,12 @@ def are_symmetric(
     n_seeds = N_SEEDS if density.seed_names else 1
     chosen = np.tile(rng.integers(len(next(iter(values.values()))), size=N_POINTS), n_seeds)
     points = {name: of_name[chosen] for name, of_name in values.items()}
-    moved = [points]
-    for one in tried:
-        labels = np.arange(one.count)
-        for order in (np.array([1, 0, *labels[2:]]), np.roll(labels, 1)):
+    moved, of = [points], list[int]()
+    for i, one in enumerate(tried):
+        labels = range(one.count)
+        for order in dict.fromkeys([(1, 0, *labels[2:]), (*labels[1:], 0)]):  # the same of two
             moved.append(one.permuted(points, np.tile(order, (len(chosen), 1))))
+            of.append(i)
     joined = {name: np.concatenate([one[name] for one in moved]) for name in points}
     if as_they_are:
         example = {name: of_name[0] for name, of_name in points.items()}
@@ -128,13 +129,15 @@ def are_symmetric(
         x = np.concatenate([one.reshape(len(one), -1) for one in joined.values()], axis=1)
     else:
         evaluate, x = density.evaluate, unconstrained(density.model, joined)
-    found, inside = np.full(len(x), np.nan), np.isfinite(x).all(axis=1)
+    at, inside = np.full(len(x), np.nan), np.isfinite(x).all(axis=1)
     seeds = rng.integers(np.iinfo(np.int64).max, size=(len(x), len(density.seed_names)))
-    found[inside] = evaluate(x[inside], seeds[inside])
-    before, after = np.split(found.reshape(-1, n_seeds, N_POINTS), [1])
+    at[inside] = evaluate(x[inside], seeds[inside])
+    before, after = np.split(at.reshape(-1, n_seeds, N_POINTS), [1])
     with np.errstate(invalid="ignore"):  # of infinities, which tell nothing
-        change = after.reshape(len(tried), 2, n_seeds, N_POINTS) - before
-        error = change.std(axis=2, ddof=1) / n_seeds**0.5 if n_seeds > 1 else 0.0
+        change = after - before
+        error = change.std(axis=1, ddof=1) / n_seeds**0.5 if n_seeds > 1 else 0.0
         rounding = ROUNDING * (10.0 + np.abs(before).max())
-        is_same = (np.abs(change.mean(axis=2)) <= rounding + 4.0 * error) & (error <= MAX_ERROR)
-    return np.asarray(is_same.all(axis=(1, 2)))
+        is_same = (np.abs(change.mean(axis=1)) <= rounding + 4.0 * error) & (error <= MAX_ERROR)
+    found = np.ones(len(tried), dtype=bool)
+    np.logical_and.at(found, of, is_same.all(axis=1))
+    return found
