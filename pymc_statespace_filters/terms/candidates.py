@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from ..errors import ModelError
 from ..pymc_model.elements import Columns, Elements
+from ..pymc_model.ends_of_support import ends_of_support
 from ..pymc_model.prior import is_improper
 from ..pymc_model.switched_density import Switches
 from ..system.checks import is_finite
-from .support import support
 
 Key = str | tuple[str, ...]
 
@@ -143,10 +143,12 @@ def _check_support(candidates: Candidates, model: pm.Model) -> None:
 
 
 def _limits(name: str, elements: Elements, model: pm.Model) -> dict[int, tuple[float, float]]:
-    """The limits of a variable by column."""
+    """The limits of a variable by column; infinite if they depend on others, or are joint."""
     columns = [i for i, of in enumerate(elements.variables) if of == name]
-    lower, upper = support(model[name], model, len(columns))
-    return dict(zip(columns, zip(lower, upper, strict=True), strict=True))
+    ends = ends_of_support(model[name], model)
+    if ends is None or len(ends[0]) != len(columns):
+        return dict.fromkeys(columns, (-np.inf, np.inf))
+    return dict(zip(columns, zip(*ends, strict=True), strict=True))
 
 
 def _values(key: Key, value: Any, sizes: list[int]) -> NDArray[np.float64]:

@@ -437,3 +437,15 @@ def test_bad_arguments():
         psf.drift_evidence(idata, other, var_names="s")
     with pytest.raises(ModelError, match="support of 'u' must begin at zero"):
         StrengthsAtPoints(other, ["u"])
+
+
+@pytest.mark.parametrize(
+    ("prior", "is_signed", "largest"),
+    [(lambda: pm.Beta("s", 1, 3), False, 1.0), (lambda: pm.HalfNormal("s"), False, np.inf),
+     (lambda: pm.Uniform("s", -2, 2), True, 2.0), (lambda: pm.Normal("s"), True, np.inf)],
+)  # fmt: skip
+def test_a_strength_is_signed_if_its_support_reaches_below_zero(prior, is_signed, largest):
+    with pm.Model() as model:
+        prior()
+    found = StrengthsAtPoints(model, ["s"])(np.zeros((1, 1)))
+    assert (found.is_signed.item(), found.largest.item()) == (is_signed, largest)

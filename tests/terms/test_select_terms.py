@@ -490,12 +490,14 @@ def test_chains_with_draws_of_another_law(monkeypatch):
 
 def test_a_value_that_the_prior_excludes_is_refused():
     with pm.Model() as model:
-        b, c = pm.Uniform("b", -3, 3, shape=2), pm.HalfNormal("c", 1)
-        pm.Normal("y", b.sum() + c, 1.0, observed=[0.5, 1.0])
+        b, c = pm.Uniform("b", -3, 3, shape=2), pm.HalfNormal("c", 1, default_transform=None)
+        pm.Normal("y", b.sum() + c * pm.Beta("p", 2, 2), 1.0, observed=[0.5, 1.0])
     with pytest.raises(ModelError, match=r"'b\[1\]' that its prior permits, from -3 to 3, got 5"):
         psf.select_terms(model, {"b[1]": 5.0})
     with pytest.raises(ModelError, match="'c' that its prior permits, from 0 to inf, got -1"):
         psf.select_terms(model, {"c": -1.0})
+    with pytest.raises(ModelError, match="'p' that its prior permits, from 0 to 1, got 2"):
+        psf.select_terms(model, {"p": 2.0})
     read_candidates(model, {"b[0]": 3.0, "c": 0.0})  # on the edge
 
 

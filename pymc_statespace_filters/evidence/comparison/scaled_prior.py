@@ -30,6 +30,7 @@ from pytensor.tensor.variable import TensorVariable
 from ...compiler.native.rows import at_points
 from ...errors import ModelError
 from ...importance import MIN_EFFECTIVE, SAME, log_mean, log_mean_of_draws, mcse, pareto_k
+from ...pymc_model.ends_of_support import bounds_of_support
 from ...pymc_model.posterior_draws import populations_of
 from ...pymc_model.prior import can_sample
 
@@ -181,21 +182,6 @@ def _log_ratio(
     scaled = pm.logp(rv, centre + (value - centre) / width).sum() - size * pt.log(width)
     beyond = _beyond(value, lower, upper, centre, width)
     return scaled - pm.logp(rv, value).sum(), beyond
-
-
-def bounds_of_support(rv: TensorVariable) -> tuple[TensorVariable, TensorVariable]:
-    """Ends of the support, which may be infinite."""
-    support = _default_transform(rv.owner.op, rv)
-    ends: tuple[TensorVariable | None, TensorVariable | None] = (None, None)
-    if isinstance(support, LogTransform):
-        ends = (pt.constant(0.0), None)
-    elif isinstance(support, IntervalTransform):
-        ends = support.args_fn(*rv.owner.inputs)
-    lower, upper = ends
-    return (
-        pt.constant(-np.inf) if lower is None else lower,
-        pt.constant(np.inf) if upper is None else upper,
-    )
 
 
 def _beyond(

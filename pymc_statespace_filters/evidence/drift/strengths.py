@@ -17,9 +17,9 @@ from pytensor.tensor.variable import TensorVariable
 
 from ...compiler.native.rows import at_points
 from ...errors import ModelError
+from ...pymc_model.ends_of_support import ends_of_support
 from ...pymc_model.inspection import parameter_graphs, state_space_nodes
 from ...pymc_model.prior import is_improper
-from ..comparison.scaled_prior import bounds_of_support
 
 Array = NDArray[np.float64]
 
@@ -131,14 +131,10 @@ def _log_jacobian(rv: TensorVariable, model: pm.Model) -> TensorVariable:
 
 def _ends(rv: TensorVariable, model: pm.Model) -> tuple[Array, NDArray[np.bool_]]:
     """The end of the support of every scalar, (d,), and whether it reaches as far below zero."""
-    bounds = bounds_of_support(rv)
-    shape = model.eval_rv_shapes()[rv.name]
-    if set(ancestors(bounds)) & set(model.basic_RVs):
+    ends = ends_of_support(rv, model)
+    if ends is None:
         raise ModelError(f"the support of {rv.name!r} must not depend on other variables")
-    lower, upper = (
-        np.broadcast_to(bound.eval(mode="FAST_COMPILE"), shape).astype(float).ravel()
-        for bound in bounds
-    )
+    lower, upper = ends
     is_signed = lower == -upper
     if not (is_signed | (lower == 0)).all():
         raise ModelError(
