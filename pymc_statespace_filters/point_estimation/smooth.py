@@ -247,7 +247,8 @@ def _trusted_gains(function: BatchFunction, local: _Local, probes: Array) -> Arr
     twins = probes[..., None, :] + TWIN * np.multiply.outer(range(N_TWINS), local.scale.sum(axis=1))
     values = function(twins.reshape(-1, len(local.point))).reshape(twins.shape[:-1])
     gains = values[..., 0] - local.value
-    rounding = np.ptp(values, axis=-1)
+    with np.errstate(invalid="ignore"):  # where no twin has a density there is no rounding
+        rounding = np.ptp(values, axis=-1)
     is_blurred = (rounding > ROUNDING) & (np.abs(gains) < TRUSTED * rounding)
     return np.where(np.logical_or.accumulate(is_blurred, axis=1), 0.0, gains)
 

@@ -14,6 +14,7 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.point_estimation.estimate import Peak
 from pymc_statespace_filters.point_estimation.maximum_likelihood import errors_of
 from pymc_statespace_filters.point_estimation.noisy import maximize_estimated
+from pymc_statespace_filters.point_estimation.smooth import _Local, _trusted_gains
 from pymc_statespace_filters.sampling.starts.annealing import Population
 
 YEARS = np.arange(40)
@@ -43,6 +44,18 @@ def test_the_year_of_a_switch_has_an_interval_and_the_others_their_errors():
     )
     assert low_end <= found.estimate["year"] <= high_end
     assert high_end - low_end < 4.0
+
+
+def test_a_ray_that_leaves_the_support_has_gains_without_a_warning():
+    """As of counts whose overdispersion vanishes, which the filter treats no more."""
+    local = _Local(np.zeros(1), 0.0, np.eye(1), np.zeros(1), -np.eye(1), 0.0)
+    probes = np.array([[[1.0], [2.0], [4.0]], [[-1.0], [-2.0], [-4.0]]])
+
+    def density(x):
+        return np.where(abs(x[:, 0]) < 3.0, -0.5 * x[:, 0] ** 2, -np.inf)
+
+    gains = _trusted_gains(density, local, probes)
+    np.testing.assert_array_equal(gains, [[-0.5, -2.0, -np.inf]] * 2)
 
 
 def test_a_curvature_at_a_bound_is_no_standard_error():
