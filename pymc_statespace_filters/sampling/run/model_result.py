@@ -1,10 +1,8 @@
 """What the chains of a model have found: the DataTree, and the facts about the run."""
 
-from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pymc.model import Model
 from xarray import DataTree
 
 from ...facts import tell
@@ -16,99 +14,83 @@ from ...pymc_model.posterior_draws import STATES
 from ..kernel.state import LOG_DENSITY, ChainState, Draws, side_generator
 from ..output.convergence import Convergence
 from ..output.datatree import to_datatree
-from ..output.facts import EndedChain, EndedDram
+from ..output.facts import EndedChain, EndedDram, of_model
 from ..output.likelihood_variance import TOO_NOISY, SeedSpread, spread_at_highest_draw
 from ..output.phase_statistics import PhaseStatistics
 from ..output.sample_stats import stat_dims, whole_chain
-from ..target.record_target import RecordTarget
-from ..target.target import Target
 from .continuation import stored_states
 from .record_chain import chain_of
-from .request import SamplingRequest
-from .stopping import Length
+
+if TYPE_CHECKING:
+    from .model_task import ModelTask
 
 _MOST_POSITIONS = 20_000  # that what helps slow chains is seen from
 
 
-@dataclass(frozen=True)
 class ModelResult:
     """The chains of a model at their end.
 
-    Attributes
+    Parameters
     ----------
+    task : ModelTask
+        Of the model, whose results these are.
     results : list of (Draws, ChainState)
         Of each chain; empty once the DataTree is made.
-    length, n_iterations
-        Draws that chains were to have after the warm-up, and iterations with the warm-up.
-    is_complete : bool
-        Whether all chains have made these.
-    measures_noise : bool
-        Whether the noise of the likelihood is to be measured.
-    seconds : float
-        That sampling took.
-    level : float
-        The median log-density of the points of the search for starts, -inf without one.
-    is_noisy : bool
-        Whether a warning has said that the likelihood is too noisy there.
     convergence : Convergence, optional
         The diagnostics, if they were asked for.
-    begin : str
-        The beginning of messages: the name of the model, if there are several.
     """
 
-    model: Model
-    request: SamplingRequest
-    target: Target | RecordTarget
-    results: list[tuple[Draws, ChainState]]
-    length: Length
-    n_iterations: int
-    is_complete: bool
-    measures_noise: bool
-    seconds: float
-    level: float
-    is_noisy: bool
-    convergence: Convergence | None
-    begin: str
+    def __init__(
+        self,
+        task: "ModelTask",
+        results: list[tuple[Draws, ChainState]],
+        convergence: Convergence | None,
+        *,
+        is_complete: bool,
+    ):
+        self.task, self.results, self.convergence = task, results, convergence
+        self.is_complete = is_complete
 
     def to_datatree(self, *, check_convergence: bool, report_level: str) -> DataTree:
         """Make the DataTree, and tell how the run went; the results are released one by one."""
-        target, request, results = self.target, self.request, self.results
+        task, results = self.task, self.results
+        target, request = task.prepare(), task.request
         of_results = self._facts()
         states = self._stored_states()
         key = results[0][1].key
         chains = []
         while results:
-            chains.append(whole_chain(target, *results.pop(0), request.tune, self.length.thin))
+            chains.append(whole_chain(target, *results.pop(0), request.tune, task.length.thin))
         tree = to_datatree(
-            self.model,
+            task.model,
             target.raveled,
             chains,
             tune=request.tune,
             keep_warmup=request.keeps_warmup,
-            sampling_time=self.seconds,
+            sampling_time=task.seconds,
             stat_dims=stat_dims(target),
         )
         tree.attrs |= {
-            **filters_used(self.model),
+            **filters_used(task.model),
             "exact": int(target.exact),
             "refresh_noise": int(request.settings.refresh_noise),
             "correlation": request.settings.correlation or 0.0,
-            "iterations_per_draw": self.length.thin,
+            "iterations_per_draw": task.length.thin,
         }
         if (spread := of_results["spread"]) is not None:
             tree.attrs["log_likelihood_variance"] = spread[1].variance
-            if self.is_noisy and TOO_NOISY < spread[1].variance < np.inf:
+            if task.is_noisy and TOO_NOISY < spread[1].variance < np.inf:
                 of_results["spread"] = None  # it was said before the chains began
         if states is not None:
             tree[STATES] = states
         ended = EndedDram(
-            model=self.model,
+            model=task.model,
             target=target,
             request=request,
             tree=tree,
-            names=element_names(self.model, target.raveled.variables),
-            length=self.length,
-            seconds=self.seconds,
+            names=element_names(task.model, target.raveled.variables),
+            length=task.length,
+            seconds=task.seconds,
             convergence=self.convergence,
             rngs=(side_generator(key, 3), side_generator(key, 2)),
             is_checked=check_convergence,
@@ -116,18 +98,18 @@ class ModelResult:
             is_complete=self.is_complete,
             **of_results,
         )
-        tell(ended, self.begin)
+        tell(ended, of_model(task.name))
         return tree
 
     def _facts(self) -> dict[str, Any]:
         """What is seen in the results alone, see `EndedDram`."""
-        tune, target = self.request.tune, self.target
+        task, tune, target = self.task, self.task.request.tune, self.task.prepare()
         draws = [of_chain for of_chain, _ in self.results]
         lengths = [len(of_chain.positions) for of_chain in draws]
         chains = {
             i: EndedChain(
                 target,
-                PhaseStatistics.from_draws(of_chain, tune, lengths[i], self.length.thin),
+                PhaseStatistics.from_draws(of_chain, tune, lengths[i], task.length.thin),
                 target.growth(state),
             )
             for i, (of_chain, state) in enumerate(self.results)
@@ -135,22 +117,22 @@ class ModelResult:
         }
         log_densities = {i: draws[i].numbers[tune:, LOG_DENSITY] for i in chains}
         n_parameters = target.raveled.dim
-        positions = self.request.with_former({i: d.positions[tune:] for i, d in enumerate(draws)})
+        positions = task.request.with_former({i: d.positions[tune:] for i, d in enumerate(draws)})
         step = 1 + sum(map(len, positions)) // _MOST_POSITIONS
         return {
             "lengths": lengths,
             "chains": chains,
             "lower": lower_chains(log_densities, n_parameters),
-            "below": nats_below(self.level, log_densities, n_parameters),
+            "below": nats_below(task.level, log_densities, n_parameters),
             "positions": np.concatenate([of_chain[::step] for of_chain in positions]),
             "spread": unless_interrupted(self._spread, None),
         }
 
     def _spread(self) -> tuple[int, SeedSpread] | None:
         """The likelihood's noise after a complete run, if it is to be measured."""
-        request, target = self.request, self.target
+        task, request, target = self.task, self.task.request, self.task.prepare()
         lengths = {len(draws.positions) for draws, _ in self.results}
-        if not self.measures_noise or lengths != {request.tune + self.length.draws}:
+        if not task.measures_noise or lengths != {request.tune + task.length.draws}:
             return None
         keys = [state.key for _, state in self.results]
         return spread_at_highest_draw(
@@ -163,14 +145,14 @@ class ModelResult:
 
     def _stored_states(self) -> DataTree | None:
         """The states from which complete chains can go on."""
-        request, former = self.request, self.request.former
-        if not self.is_complete or self.n_iterations <= request.tune:
+        task, request, former = self.task, self.task.request, self.task.request.former
+        if not self.is_complete or task.n_iterations <= request.tune:
             return None
         return stored_states(
-            self.model,
+            task.model,
             [state for _, state in self.results],
-            iterations=self.n_iterations + (0 if former is None else former.iterations),
-            draws=self.length.draws + (0 if former is None else len(former.positions[0])),
-            thin=self.length.thin,
+            iterations=task.n_iterations + (0 if former is None else former.iterations),
+            draws=task.length.draws + (0 if former is None else len(former.positions[0])),
+            thin=task.length.thin,
             settings=request.settings,
         )

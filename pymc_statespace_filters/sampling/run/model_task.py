@@ -78,8 +78,8 @@ class ModelTask:
         self._group = group
         self.checkpoint: RecordFile | None = None
         self.population: np.ndarray | None = None
-        self._level = -np.inf  # median log-density of the points of the search for starts
-        self._is_noisy = False  # and whether too much noise there has been named
+        self.level = -np.inf  # median log-density of the points of the search for starts
+        self.is_noisy = False  # and whether too much noise there has been named
         self._given = target
         self._target: Target | RecordTarget | None = None
         self.n_iterations = stops_of(request)[0]  # after which the chains end, for now
@@ -116,7 +116,7 @@ class ModelTask:
                 self._seeds,
                 disperse=request.tune > 0,
             )
-            self._measures_noise = is_measured(target, request.n_iterations)
+            self.measures_noise = is_measured(target, request.n_iterations)
         return self._target
 
     def chain_task(
@@ -148,7 +148,7 @@ class ModelTask:
             stored=stored,
             store=store,
             keeps_warmup=request.keeps_warmup,
-            measures_noise=self._measures_noise,
+            measures_noise=self.measures_noise,
             population=population,
             proposal_cov=cov,
             mixture=self.mixture,
@@ -215,7 +215,7 @@ class ModelTask:
             return True
         if self.request.until_ess is None:
             return False
-        longer = next_length(self.request, self.length, self.convergence(), self._seconds)
+        longer = next_length(self.request, self.length, self.convergence(), self.seconds)
         if longer is None:
             return False
         if longer.thin > self.length.thin:
@@ -227,7 +227,7 @@ class ModelTask:
     def set_population(self, found: SearchedPoints | None) -> None:
         """Set what the search for starts has found."""
         if found is not None:
-            self.population, self._level, self._is_noisy = found
+            self.population, self.level, self.is_noisy = found
 
     def set_length(self, length: Length) -> None:
         """Set the length after which chains end, before any has begun."""
@@ -247,7 +247,8 @@ class ModelTask:
         return request.draws if request.doubles_thin else request.max_draws or request.draws
 
     @property
-    def _seconds(self) -> float:
+    def seconds(self) -> float:
+        """That sampling took."""
         return self._ended - self._began
 
     def stored_length(self) -> Length:
@@ -312,19 +313,6 @@ class ModelTask:
         request, found, is_complete = self.request, None, self.is_complete
         if check_convergence or request.until_ess is not None:
             found = unless_interrupted(self.convergence, None)
-        result = ModelResult(
-            self.model,
-            request,
-            self.prepare(),
-            [self._results.pop(index) for index in range(request.chains)],
-            length=self.length,
-            n_iterations=self.n_iterations,
-            is_complete=is_complete,
-            measures_noise=self._measures_noise,
-            seconds=self._seconds,
-            level=self._level,
-            is_noisy=self._is_noisy,
-            convergence=found,
-            begin=of_model(self.name),
-        )
+        results = [self._results.pop(index) for index in range(request.chains)]
+        result = ModelResult(self, results, found, is_complete=is_complete)
         return result.to_datatree(check_convergence=check_convergence, report_level=report_level)
