@@ -6,7 +6,12 @@ from ..evidence.facts import PartsOfPosterior
 from ..parallel.shared_rows import by_first_rank
 from ..parallel.signals import unless_interrupted
 from ..pymc_model.density import ModelDensity
-from ..pymc_model.posterior_draws import are_populations, noise_was_moved, unconstrained_draws
+from ..pymc_model.posterior_draws import (
+    MIN_DRAWS,
+    are_populations,
+    noise_was_moved,
+    unconstrained_draws,
+)
 from ..sampling.output.facts import EndedRun
 from ..unvisited.check import MOST_PARAMETERS
 from ..unvisited.sentences import store, stored, unvisited
@@ -38,6 +43,8 @@ def _(fact: PartsOfPosterior) -> list[str]:
 def missed_of(fact: EndedRun) -> list[str]:
     """Say what the draws lack, and whether their integration steps are too long."""
     nothing: list[str] = []
+    if fact.tree["posterior"].sizes["draw"] < MIN_DRAWS:
+        return nothing
     return [
         *unless_interrupted(lambda: _missed_parts(fact), nothing),
         *unless_interrupted(lambda: step_problems(fact.tree, fact.model), nothing),

@@ -46,6 +46,17 @@ def test_steps_too_long_are_named(record, system, is_named, caplog):
     assert ("steps half as long the posterior would move" in caplog.text) == is_named
 
 
+def test_a_run_of_few_draws_is_not_looked_at(record):
+    observed = record["observations"][:3]
+    with pm.Model():
+        pm.HalfNormal("k", 4.0)
+        psf.StateSpace(
+            "d", decay(0.5), psf.EKF(), params={"s": 1.0}, steps=[1, 2, 3], observed=observed
+        )
+        idata = psf.sample_dram(5, tune=5, chains=1, random_seed=1, progressbar=False)
+    assert idata["posterior"].sizes["draw"] == 5
+
+
 def test_draws_that_do_not_vary_tell_nothing(record):
     stuck = xr.Dataset({name: (("chain", "draw"), np.full((2, 100), 1.3)) for name in "ks"})
     with pm.Model() as model:
