@@ -34,8 +34,8 @@ RESCALING = 0.01, 1e4  # least and most curvature that a rescaling trusts
 MAX_LENGTH = 3.0  # of a scale, in standard deviations of the population
 MIN_CURVATURE = 0.3  # below, a direction is probed
 PROBES, MIN_FALL = (0.5, 1.0, 2.0, 4.0), 0.01  # distances in scales; nats
-# Points a tiny move from a probe, of which hardly all have the same rounding error; nats that do not
-# matter; a gain that is trusted, in rounding errors.
+# Points a tiny move from a probe, of which hardly all have the same rounding error; nats that do
+# not matter; a gain that is trusted, in rounding errors.
 N_TWINS, TWIN, ROUNDING, TRUSTED = 12, 1e-10, 1e-9, 100.0
 N_MOVES, MIN_GAIN = 5, 1e-10  # most moves towards a bound; nats, of a move that is worth it
 MAX_DECREMENT = 0.01  # standard errors, of the Newton step that remains

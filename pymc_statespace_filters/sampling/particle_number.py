@@ -197,8 +197,8 @@ def suggest_particles(
         n_particles, reason = _suggestion(first[name], second[name], low, high)
         if n_particles is None:
             tell(SlowVariance(model, name, reason))
-        variance = first[name].variance
-        rows.append((name, short_form(filter), variance, low, high, n_particles, reason))
+        found = first[name].variance, low, high, n_particles, reason
+        rows.append((name, short_form(filter), *found))
     columns = ["variable", "filter", "variance", "low", "high", "n_particles", "reason"]
     table = pd.DataFrame(rows, columns=columns).set_index("variable")
     return table.astype({"n_particles": "Int64"})  # which may be missing
@@ -279,6 +279,8 @@ def _suggestion(
     lies_between = (first.variance > aim) != (second.variance > aim) and ratio > 0.0
     exponent = -math.log(more) / math.log(ratio) if lies_between else 1.0
     n_particles = _rounded(second.n_particles * (second.variance / aim) ** exponent)
+    if n_particles == _LEAST:
+        return n_particles, f"{found}; {_LEAST} are the fewest"
     return n_particles, f"{found}; it should be about {aim:.1f} with {n_particles}"
 
 
