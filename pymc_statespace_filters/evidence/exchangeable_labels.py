@@ -62,8 +62,9 @@ class OneOrder:
         self, exchangeable: Any, density: ModelDensity, idata: xr.DataTree, rng: np.random.Generator
     ) -> None:
         model, values = density.model, _flat_values(density.model, idata)
-        given = [exchangeable] if isinstance(exchangeable, str) else list(exchangeable)
-        tried = _declared(given, model)
+        keys = exchangeable if isinstance(exchangeable, list | tuple) else [exchangeable]
+        given = [tuple(key) if isinstance(key, list) else key for key in keys]
+        tried = _declared(given, model, values)
         self.ordered = [
             name
             for name in tried[0].axes
@@ -119,7 +120,7 @@ def undeclared_labels(
         keys = possible[count]
         sizes = range(1, len(keys) + 1) if len(keys) <= MOST_PLACES else [len(keys)]
         subsets = [some for size in sizes for some in combinations(keys, size)]
-        tried = [one for some in subsets for one in placements(some, count, model)]
+        tried = [one for some in subsets for one in placements(some, count, model, values)]
         for i in np.flatnonzero(are_symmetric(tried, density, values, rng)):
             if taken & (one := tried[i]).names:
                 continue
@@ -139,17 +140,18 @@ def _flat_values(model: pm.Model, idata: xr.DataTree) -> dict[str, Array]:
     return {rv.name: np.concatenate(posterior[rv.name].values) for rv in model.free_RVs}
 
 
-def _declared(given: Sequence[Key], model: pm.Model) -> list[Labels]:
+def _declared(given: Sequence[Any], model: pm.Model, values: Mapping[str, Array]) -> list[Labels]:
     """All that the names may mean: a matrix may have labels along one axis or both."""
-    free = [rv.name for rv in model.free_RVs]
-    names = {name for key in given for name in ((key,) if isinstance(key, str) else key)}
-    if unknown := names - set(free):
+    names = [name for key in given for name in (key if isinstance(key, tuple) else (key,))]
+    if unknown := [name for name in names if name not in values]:
         raise ModelError(
-            f"exchangeable must name free variables of the model, {free}, got {sorted(unknown)}"
+            f"exchangeable must name free variables of the model, {list(values)}, got {unknown}"
         )
-    lengths = [len(key) if isinstance(key, tuple) else model[key].shape.eval() for key in given]
-    counts = set(np.concatenate([np.ravel(one) for one in lengths]).astype(int).tolist()) - {1}
-    found = [one for count in sorted(counts) for one in placements(given, count, model)]
+    counts = {len(key) for key in given if isinstance(key, tuple)}
+    counts |= {n for name in names for n in values[name].shape[1:]}
+    found = [
+        one for count in sorted(counts - {1}) for one in placements(given, count, model, values)
+    ]
     if not found:
         raise ModelError(
             "exchangeable must name a vector, or a tuple of scalars, and other variables with as "

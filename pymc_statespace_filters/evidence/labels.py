@@ -81,13 +81,18 @@ class Labels:
         return np.asarray(values[key][(slice(None), *index)])
 
 
-def placements(keys: Sequence[Key], count: int, model: pm.Model) -> Iterator[Labels]:
-    """What so many labels of all of these may be; their order is told by one of them."""
+def placements(
+    keys: Sequence[Key], count: int, model: pm.Model, values: Mapping[str, Array]
+) -> Iterator[Labels]:
+    """What so many labels of all of these may be; their order is told by one of them.
+
+    The values (n, ...) of the variables have their shapes.
+    """
     scalars = tuple(key for key in keys if isinstance(key, tuple))
     arrays = [key for key in keys if isinstance(key, str)]
     if any(len(names) != count for names in scalars):
         return
-    for axes in product(*(_axes(model[name].shape.eval(), count) for name in arrays)):
+    for axes in product(*(_axes(values[name].shape[1:], count) for name in arrays)):
         labels = Labels(count, dict(zip(arrays, axes, strict=True)), scalars)
         if labels.sorted_by(model):
             yield labels

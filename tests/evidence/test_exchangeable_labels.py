@@ -12,7 +12,9 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence.exchangeable_labels import OneOrder, undeclared_labels
 from pymc_statespace_filters.evidence.labels import Labels
+from pymc_statespace_filters.evidence.posterior import Posterior
 from pymc_statespace_filters.pymc_model.density import ModelDensity
+from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
 from pymc_statespace_filters.unvisited.sentences import store
 
 DATA = np.array([-2.1, -1.6, -2.4, -1.9, -2.2, 1.8, 2.3, 1.7, 2.0, 2.6])
@@ -115,6 +117,7 @@ def test_an_order_that_is_half_of_an_asymmetric_prior_is_improper():
 @pytest.mark.parametrize(
     ("exchangeable", "message"),
     [("nu", r"free variables of the model, \['mu', 'w'\], got \['nu'\]"),
+     (3, r"free variables of the model, \['mu', 'w'\], got \[3\]"),
      (["w"], "must name a vector, or a tuple of scalars"),
      (["mu", ("w", "w", "w")], "must name a vector, or a tuple of scalars")],
 )  # fmt: skip
@@ -225,6 +228,24 @@ def test_the_labels_of_regimes_are_found_in_both_axes_of_their_matrix(filter):
     rng = np.random.default_rng(5)
     labels = OneOrder(["P", "mean"], ModelDensity(model), idata, rng).labels
     assert labels.axes == {"P": (0, 1), "mean": (0,)}
+
+
+def test_sorted_draws_have_the_density_that_they_had():
+    model, idata = regimes(psf.FiniteStateFilter())
+    in_order = unconstrained_draws(idata, model)
+    P, mean = (idata["posterior"][name].values.copy() for name in ("P", "mean"))
+    P[:, ::2], mean[:, ::2] = P[:, ::2, ::-1, ::-1], mean[:, ::2, ::-1]
+    exchanged = tree(P=P, mean=mean, noise=idata["posterior"]["noise"].values)
+    density, rng = ModelDensity(model), np.random.default_rng(6)
+    x = unconstrained_draws(exchanged, model)
+    before = density.evaluate(x.reshape(200, -1)).reshape(2, 100)
+    posterior = Posterior(x, before, lambda x, rng: density.evaluate(x))
+    one_order = OneOrder(["P", "mean"], density, exchanged, rng)
+    found = one_order.restricted(one_order.sorted_draws(posterior))
+    np.testing.assert_allclose(found.draws, in_order, atol=1e-9)
+    after = found.evaluate(found.draws.reshape(200, -1), rng).reshape(2, 100)
+    np.testing.assert_allclose(after, before, rtol=1e-9)
+    assert np.isneginf(found.evaluate(x[:, ::2].reshape(100, -1), rng)).all()
 
 
 def test_labels_of_scalars_are_found():
