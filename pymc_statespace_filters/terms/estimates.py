@@ -158,17 +158,11 @@ class Sampler:
 
     def __init__(self, density: SubmodelDensity, base: Array, rng: np.random.Generator) -> None:
         self._density, self._base, self._rng = density, base, rng
-        self.n_evaluations = 0
 
     @property
     def is_noisy(self) -> bool:
         """Whether likelihoods are estimates."""
         return bool(self._density.density.seed_names)
-
-    def _log_density(self, at: Point) -> Array:
-        found = self._density.evaluate(at).total
-        self.n_evaluations += len(at.x)
-        return found
 
     def log_density_of(self, proposal: Proposal) -> BatchFunction:
         """The log-density (n,) of a sub-model at coordinates (n, d) that its proposal draws.
@@ -182,7 +176,7 @@ class Sampler:
             x, log_volume = proposal.coordinates.backward(y, proposal.drawn)
             present = np.broadcast_to(proposal.present, (len(x), len(proposal.present)))
             seeds = np.zeros((len(x), 0), dtype=np.int64)
-            return self._log_density(Point(x, present, seeds)) - log_volume
+            return self._density.evaluate(Point(x, present, seeds)).total - log_volume
 
         return evaluate
 
@@ -198,7 +192,7 @@ class Sampler:
         present = np.repeat([one.present for one in proposals], counts, axis=0)
         seeds = self._density.fresh_seeds(len(x), self._rng)
         log_q = np.concatenate([log_q for _, log_q in drawn])
-        log_weights = self._log_density(Point(x, present, seeds)) - log_q
+        log_weights = self._density.evaluate(Point(x, present, seeds)).total - log_q
         ends = np.cumsum(counts)[:-1]
         parts = (np.split(each, ends) for each in (x, seeds, log_weights))
         return [

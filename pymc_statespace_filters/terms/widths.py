@@ -14,6 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from pymc.distributions.transforms import _default_transform
 from pymc.logprob.transforms import LogTransform
+from pytensor.graph.traversal import ancestors
 from scipy.stats import norm
 
 from ..evidence.comparison.width_curves import dataset_of_curves
@@ -55,11 +56,17 @@ def inclusion_by_width(
 
 
 def _scale_of_columns(density: SubmodelDensity) -> NDArray[np.str_]:
-    """How a column is scaled, (k,): "linear", "log" or, if not at all, ""."""
+    """How a column is scaled, (k,): "linear", "log" or, if not at all, "".
+
+    A prior that depends on another candidate is not, as that one is scaled at the same points.
+    """
     model, kinds = density.model, np.full(len(density.blocks), "", dtype="<U6")
+    candidates = {model[name] for name in density.candidates.variables}
     held = density.candidates.switches.held_at(len(kinds))
     for column in np.concatenate(density.candidates.switches.columns):
         rv = density.variables[column]
+        if candidates & set(ancestors([rv])) - {rv}:
+            continue
         transform, natural = model.rvs_to_transforms[rv], _default_transform(rv.owner.op, rv)
         is_positive = isinstance(natural, LogTransform)
         if isinstance(transform, LogTransform) and held[column] == 0:

@@ -394,6 +394,29 @@ def test_slabs_of_other_widths(is_transformed):
     psf.plot_prior_sensitivity(curves, backend="none")
 
 
+def test_a_slab_that_depends_on_another_candidate_keeps_its_width():
+    """The mean of y is a + b, b is normal about a, and all is normal."""
+    y = np.array([0.8, 1.1])
+    with pm.Model() as model:
+        a = pm.Normal("a", 0, 1)
+        pm.Normal("y", a + pm.Normal("b", a, 1), 1.0, observed=y)
+    cov = np.linalg.inv(np.linalg.inv([[1.0, 1.0], [1.0, 2.0]]) + 2.0)
+    rng = np.random.default_rng(1)
+    draws = rng.multivariate_normal(cov.sum(axis=1) * y.sum(), cov, (2, 500))
+    idata = draws_of_values({"a": draws[..., 0], "b": draws[..., 1]})
+    found = psf.select_terms(
+        model, {"a": 0.0, "b": 0.0}, idata=idata, inclusion=0.5, random_seed=1, progressbar=False
+    )["widths"].to_dataset()
+    assert found.attrs["width_left_out"] == "b"
+    sets = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
+    for width in (0.25, 1.0, 4.0):
+        variances = [0.0, width**2, 1.0, 4 * width**2 + 1.0]
+        logs = [multivariate_normal(np.zeros(2), np.eye(2) + v).logpdf(y) for v in variances]
+        truth = np.exp(logs - logsumexp(logs)) @ sets
+        curve = found.sel(width=width)
+        assert (abs(curve["width_prob"] - truth) < 4 * curve["width_se"]).all()
+
+
 def test_noisy_likelihoods_have_the_evidences_of_exact_ones(monkeypatch):
     monkeypatch.setattr(enumeration, "NOISY_SE", 0.03)
     system = psf.StateSpaceModel(
