@@ -204,7 +204,7 @@ class Replications:
         with self._lock:
             self.record.set_value(self.truth_and_record(index)[1])
             task.prepare()
-            task.set_population(task.find_population(progressbar=False))
+            task.searched = task.find_population(progressbar=False)
             chain = task.chain_task(0)
         if self._setting.run:
             chain.__class__ = self._setting.run

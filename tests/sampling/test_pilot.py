@@ -261,8 +261,8 @@ def test_a_mixture_is_fitted_to_the_pilots_draws_before_the_first_iteration(mode
     found = sample(model, pilot=tree(), random_seed=2, **more)
     unconstrained = np.concatenate([np.log(SD)[..., None], PLACE], axis=-1)
     rows = np.concatenate(np.swapaxes(unconstrained, 0, 1))
-    np.testing.assert_allclose(tasks[0].population, rows, rtol=1e-11)
-    population = tasks[0].population
+    np.testing.assert_allclose(tasks[0].searched.x, rows, rtol=1e-11)
+    population = tasks[0].searched.x
     warm_up = population_search.WarmUp(
         tasks[0].request, population.shape[1], population, is_noisy=False
     )
@@ -278,7 +278,7 @@ def test_long_pilots_are_thinned_and_keep_all_chains(model, tasks):
     place += 1e-3 * np.random.default_rng(1).normal(size=place.shape)
     sd = np.exp(np.random.default_rng(2).normal(size=(4, 1000)))
     sample(model, pilot=az.from_dict({"posterior": {"place": place, "sd": sd}}), draws=2, tune=8)
-    kept = tasks[0].population[:, 1:].round()
+    kept = tasks[0].searched.x[:, 1:].round()
     assert kept.shape == (500, 2)
     np.testing.assert_array_equal(kept[:, 0], np.tile(np.arange(4), 125))
     np.testing.assert_array_equal(kept[:, 1], np.repeat(np.arange(7, 1000, 8), 4))

@@ -162,12 +162,13 @@ def test_models_are_named(caplog):
 
 def test_chains_below_what_the_search_has_met_never_reached_the_posterior(report_of, monkeypatch):
     """Told once, whatever else follows from it; not of estimates, which may be far too high."""
-    set_population = model_task.ModelTask.set_population
+    find_population = model_task.ModelTask.find_population
 
-    def higher(task, found):
-        set_population(task, found._replace(level=found.level + 100.0))
+    def higher(task, **settings):
+        found = find_population(task, **settings)
+        return found._replace(level=found.level + 100.0)
 
-    monkeypatch.setattr(model_task.ModelTask, "set_population", higher)
+    monkeypatch.setattr(model_task.ModelTask, "find_population", higher)
     _, _, messages = report_of(simple_model(), draws=50, tune=400)
     (said,) = messages[:-1]
     assert re.match(r"The chains never reached the posterior: .* stayed 10\d nats", said)

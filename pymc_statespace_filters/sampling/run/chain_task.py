@@ -58,8 +58,6 @@ class ChainTask:
         Iterations after the warm-up of which one draw, the last, is kept.
     mixture : ndarray
         Packed, of the first proposals.
-    population : ndarray, shape (m, d), optional
-        Points of which the chain starts at one, instead of a candidate.
     proposal_cov : ndarray, optional
         Of the first proposals. Default: the target's.
     index : int
@@ -88,7 +86,6 @@ class ChainTask:
         n_rows: int,
         mixture: np.ndarray,
         thin: int = 1,
-        population: np.ndarray | None = None,
         proposal_cov: np.ndarray | None = None,
         index: int = 0,
         name: str | None = None,
@@ -100,8 +97,6 @@ class ChainTask:
     ):
         self._tune, self._n_iterations = tune, n_iterations
         self._candidates, self._measures_noise = candidates, measures_noise
-        if population is not None:
-            self._candidates = lambda rng: list(rng.permutation(population)[:1])
         self._n_noisy = len(target.seed_names)
         self._index, self._name = index, name or f"chain {index}"
         self._rng = np.random.default_rng(seed)

@@ -144,7 +144,7 @@ def _find_populations(tasks: Sequence[ModelTask], comm: Communicator, *, progres
 
     found = comm.broadcast(comm.run_collectively(find))
     for task, population in zip(tasks, found, strict=True):
-        task.set_population(population)
+        task.searched = population
 
 
 def _group_size(per_chain: int, n_ranks: int) -> int:

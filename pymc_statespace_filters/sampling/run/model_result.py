@@ -79,7 +79,7 @@ class ModelResult:
         }
         if (spread := of_results["spread"]) is not None:
             tree.attrs["log_likelihood_variance"] = spread[1].variance
-            if task.is_noisy and TOO_NOISY < spread[1].variance < np.inf:
+            if task.searched.is_noisy and TOO_NOISY < spread[1].variance < np.inf:
                 of_results["spread"] = None  # it was said before the chains began
         if states is not None:
             tree[STATES] = states
@@ -123,7 +123,7 @@ class ModelResult:
             "lengths": lengths,
             "chains": chains,
             "lower": lower_chains(log_densities, n_parameters),
-            "below": nats_below(task.level, log_densities, n_parameters),
+            "below": nats_below(task.searched.level, log_densities, n_parameters),
             "positions": np.concatenate([of_chain[::step] for of_chain in positions]),
             "spread": unless_interrupted(self._spread, None),
         }

@@ -77,9 +77,7 @@ class ModelTask:
         self.model, self.request, self.name = model, request, name
         self._group = group
         self.checkpoint: RecordFile | None = None
-        self.population: np.ndarray | None = None
-        self.level = -np.inf  # median log-density of the points of the search for starts
-        self.is_noisy = False  # and whether too much noise there has been named
+        self.searched = SearchedPoints()
         self._given = target
         self._target: Target | RecordTarget | None = None
         self.n_iterations = stops_of(request)[0]  # after which the chains end, for now
@@ -129,16 +127,18 @@ class ModelTask:
         target, request, key = self.prepare(), self.request, key_of_chain(index)
         if self.checkpoint is not None:
             stored, store = self.checkpoint.read(key), partial(self.checkpoint.append, key)
-        population = self.population if request.initvals is None else None
-        cov = None
+        candidates, cov = self._candidates[index], None
+        population = self.searched.x if request.initvals is None else None
         if isinstance(target, Target):
-            given = self._candidates[index](np.random.default_rng(0))[-1]
+            given = candidates(np.random.default_rng(0))[-1]
             cov = first_cov(request, target, population, given)
+        if population is not None:
+            candidates = partial(_one_of, population)
         return ChainTask(
             target,
             request.tune,
             self.n_iterations,
-            self._candidates[index],
+            candidates,
             self._seeds[index],
             n_rows=request.tune + self._most_draws,
             thin=self.thin,
@@ -149,13 +149,12 @@ class ModelTask:
             store=store,
             keeps_warmup=request.keeps_warmup,
             measures_noise=self.measures_noise,
-            population=population,
             proposal_cov=cov,
             mixture=self.mixture,
         )
 
-    def find_population(self, *, progressbar: bool) -> SearchedPoints | None:
-        """Points of the posterior, found once for all chains; None if starts are given otherwise.
+    def find_population(self, *, progressbar: bool) -> SearchedPoints:
+        """Points of the posterior, found once for all chains; none if starts are given otherwise.
 
         None, too, if every record finds its own start, see `RecordChain.start`.
 
@@ -166,7 +165,7 @@ class ModelTask:
         """
         target = self.prepare()
         if isinstance(target, RecordTarget):
-            return None
+            return SearchedPoints()
         return search_population(
             self.model,
             target,
@@ -224,11 +223,6 @@ class ModelTask:
         self._store_length()
         return True
 
-    def set_population(self, found: SearchedPoints | None) -> None:
-        """Set what the search for starts has found."""
-        if found is not None:
-            self.population, self.level, self.is_noisy = found
-
     def set_length(self, length: Length) -> None:
         """Set the length after which chains end, before any has begun."""
         self.length = length
@@ -273,7 +267,7 @@ class ModelTask:
         target = self.prepare()
         dim = target.raveled.dim if isinstance(target, Target) else 0
         is_noisy = bool(target.seed_names)
-        return WarmUp(self.request, dim, self.population, is_noisy=is_noisy)
+        return WarmUp(self.request, dim, self.searched.x, is_noisy=is_noisy)
 
     def convergence(self) -> Convergence | None:
         """Diagnostics of the results; computed once, as it takes long for many draws."""
@@ -316,3 +310,8 @@ class ModelTask:
         results = [self._results.pop(index) for index in range(request.chains)]
         result = ModelResult(self, results, found, is_complete=is_complete)
         return result.to_datatree(check_convergence=check_convergence, report_level=report_level)
+
+
+def _one_of(population: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
+    """The only candidate for a start: one of the points (m, d)."""
+    return list(rng.permutation(population)[:1])

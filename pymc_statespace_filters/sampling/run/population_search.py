@@ -103,12 +103,12 @@ class WarmUp:
 
 
 class SearchedPoints(NamedTuple):
-    """Points of the posterior (m, d), and their median log-density, if it is known.
+    """Points of the posterior (m, d), if there are, and their median log-density, if it is known.
 
     ``is_noisy`` tells whether a warning has said that the likelihood is too noisy there.
     """
 
-    x: np.ndarray
+    x: np.ndarray | None = None
     level: float = -np.inf
     is_noisy: bool = False
 
@@ -121,8 +121,8 @@ def search_population(
     begin: str,
     *,
     progressbar: bool,
-) -> SearchedPoints | None:
-    """Points of the posterior, stored in the checkpoint; None if starts are given otherwise.
+) -> SearchedPoints:
+    """Points of the posterior, stored in the checkpoint; none if starts are given otherwise.
 
     None with a short warm-up of an expensive filter, too, and if the noise is carried. A pilot
     that lacks no variable has the points itself. ``begin`` is the beginning of messages.
@@ -144,7 +144,7 @@ def search_population(
     ):
         if pilot is not None:
             raise ModelError(begin + _UNUSABLE_PILOT)
-        return None
+        return SearchedPoints()
     if checkpoint is not None and (stored := checkpoint.read(_STARTS)) is not None:
         return SearchedPoints(stored.draws["population"], float(stored.state["level"]))
     try:
