@@ -8,6 +8,7 @@ likelihood of the rows.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from hashlib import blake2b
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from ..system.checks import check_finite, check_random_seed
 from ..system.model import StateSpaceModel
 from ..system.parameters import flat_parameters
 from .filter_steps import FilterSteps, Step, filter_steps
-from .row_steps import Place, RowSteps
+from .row_steps import Place, RowSteps, numbers_of_row
 
 Array = NDArray[np.float64]
 
@@ -57,7 +58,7 @@ class Prediction(NamedTuple):
 class OnlineState:
     """Where an online filter stands: a value that pickles, and from which another one goes on."""
 
-    identity: tuple[str, str]  # of the system and the filter
+    identity: tuple[str, str, str]  # of the system, the filter and all parameters
     theta: Array
     seeds: NDArray[np.int64]
     log_weights: Array
@@ -77,11 +78,15 @@ class OnlineFilter:
         self._theta, self._seeds, self._log_weights = state.theta, state.seeds, state.log_weights
         at, is_on_grid = (state.t0, state.step, state.time, state.resets), state.is_on_grid
         self._steps = RowSteps(system, *at, is_on_grid=is_on_grid)
-        self._points = self._points_from(state.left)
+        self._points = self._points_from(state.left, is_on_grid)
 
-    def _points_from(self, left: list[Array]) -> FilterSteps:
-        given = self._steps.system, self._filter, self._theta, self._seeds, self._start.t0
-        return filter_steps(*given, left)
+    def _points_from(self, left: list[Array], is_on_grid: bool) -> FilterSteps:
+        system = self._steps.system_of(is_on_grid)
+        return filter_steps(system, self._filter, self._theta, self._seeds, self._start.t0, left)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy stands where this one does, in memory of its own."""
+        return OnlineFilter, (self._system, self._filter, self.state)
 
     @property
     def state(self) -> OnlineState:
@@ -105,7 +110,7 @@ class OnlineFilter:
         Parameters
         ----------
         observed : float or array_like, shape (p,)
-            NaN marks a missing component.
+            NaN marks a missing component; a Series is aligned with ``observables`` by its index.
         step : int
             The row's step, later than that of the row before. Or give `time`.
         time : float
@@ -126,32 +131,33 @@ class OnlineFilter:
             filter then stands where it was.
         """
         datum = self._checked(observed)
-        place, found = self._evaluated(datum, step, time, inputs)
+        place, points, found = self._evaluated(datum, step, time, inputs)
         terms, codes, mean, cov = found
         if len(codes) == 1 and codes[0] == NONE:
-            self._points.keep()
+            points.keep()
             row = Row(float(terms[0]), mean[0], cov[0], 1.0)
         else:
-            row = self._mixed(place, terms, codes, mean, cov)
+            row = self._mixed(place, points, found)
+        self._points = points
         self._steps.passed(place, datum)
         return row
 
     def _evaluated(
         self, datum: Array, step: int | None, time: float | None, inputs: Any
-    ) -> tuple[Place, Step]:
+    ) -> tuple[Place, FilterSteps, Step]:
         """A row at all points, from where the filter stands."""
-        system = self._steps.system
-        place = self._steps.place(step, time)
-        if self._steps.system is not system:  # which has left the grid
-            self._points = self._points_from(self._points.left)
-        return place, self._points(place.step, datum, self._steps.rows(place, inputs))
+        place, points = self._steps.place(step, time), self._points
+        if place.is_on_grid != self._steps.is_on_grid:  # the first row off the grid
+            points = self._points_from(points.left, place.is_on_grid)
+        return place, points, points(place.step, datum, self._steps.rows(place, inputs))
 
-    def _mixed(self, place: Place, terms: Array, codes: Array, mean: Array, cov: Array) -> Row:
+    def _mixed(self, place: Place, points: FilterSteps, found: Step) -> Row:
         """The row of several draws, of which those that fail are left out from now on."""
+        terms, codes, mean, cov = found
         is_alive = codes == NONE
         if not is_alive.any():
             raise _failed(f"the row at step {place.step} has no likelihood", codes)
-        self._points.keep(None if is_alive.all() else is_alive)
+        points.keep(None if is_alive.all() else is_alive)
         self._theta, self._seeds = self._theta[is_alive], self._seeds[is_alive]
         log_weights = self._log_weights[is_alive] + terms[is_alive]
         log_likelihood = float(np.logaddexp.reduce(log_weights))
@@ -164,7 +170,7 @@ class OnlineFilter:
         self, *, step: int | None = None, time: float | None = None, inputs: Any = None
     ) -> Prediction:
         """The state at a later step or time, given the rows so far; arguments as of `update`."""
-        place, found = self._evaluated(np.full(self._system.p, np.nan), step, time, inputs)
+        place, _, found = self._evaluated(np.full(self._system.p, np.nan), step, time, inputs)
         _, codes, mean, cov = found
         is_alive = codes == NONE
         if not is_alive.any():
@@ -173,7 +179,10 @@ class OnlineFilter:
         return Prediction(*_mixture(weights / weights.sum(), mean[is_alive], cov[is_alive]))
 
     def _checked(self, observed: Any) -> Array:
-        datum = np.asarray(observed, dtype=np.float64).reshape(-1)
+        is_plain = type(observed) is np.ndarray and observed.dtype == np.float64
+        if not (is_plain or type(observed) is float):
+            observed = numbers_of_row("observed", observed, self._system.observables, "observables")
+        datum = np.asarray(observed).reshape(-1)
         if datum.size != self._system.p:
             raise ModelError(
                 f"observed must have a number for each of {list(self._system.observables)}, got "
@@ -252,13 +261,13 @@ def online(
     theta = np.atleast_2d(flat_parameters(system, params))
     if theta.ndim != 2 or not len(theta):
         raise ModelError(f"params must be numbers or draws along one dimension, got {theta.shape}")
-    identity = system.fingerprint, repr(filter)
+    identity = system.fingerprint, repr(filter), blake2b(theta.tobytes()).hexdigest()
     if state is not None:
         if not isinstance(state, OnlineState):
             raise ModelError(f"state must be that of an online filter, got {type(state).__name__}")
-        if state.identity != identity:
+        if state.identity[:2] != identity[:2]:
             raise ModelError("state must be of the same system and filter, got one of another")
-        if not np.isin(state.theta, theta).all():
+        if state.identity != identity:
             raise ModelError("state must be of the same parameters, got one of others")
         return OnlineFilter(system, filter, state)
     rng = check_random_seed(random_seed)

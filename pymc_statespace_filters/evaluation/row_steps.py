@@ -1,16 +1,19 @@
 """Where the next row of a record lies: its step, and the inputs of the steps that lead there."""
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from ..errors import ModelError
-from ..system.checks import check_finite, is_integer
+from ..system.checks import check_finite, check_floats, is_integer
 from ..system.input_columns import columns_between, resets_at
+from ..system.labels import columns_in_order
 from ..system.model import StateSpaceModel
-from ..system.steps import GRID_TOLERANCE
+from ..system.steps import GRID_TOLERANCE, MOST_STEPS, too_many_steps
 from ..system.time_axis import TimeAxis
 from .filter_steps import InputRows
 
@@ -23,6 +26,7 @@ class Place(NamedTuple):
     step: int
     time: float
     length: float
+    is_on_grid: bool  # and all rows before
 
 
 class RowSteps:
@@ -30,8 +34,8 @@ class RowSteps:
 
     Attributes
     ----------
-    system : StateSpaceModel
-        The user's; with steps of any length from the first row on that lies off the grid.
+    is_on_grid : bool
+        Whether all rows so far lie on the grid.
     step, time : int, float
         Of the last row; -1 and ``t0`` before the first.
     resets : ndarray
@@ -48,26 +52,24 @@ class RowSteps:
         *,
         is_on_grid: bool,
     ) -> None:
-        self._on_grid, self.system = system, system if is_on_grid else system.at_any_times
+        self._system, self.is_on_grid = system, is_on_grid
         self._t0, self.step, self.time, self.resets = t0, step, time, resets
 
-    @property
-    def is_on_grid(self) -> bool:
-        """Whether all rows so far lie on the grid."""
-        return self.system is self._on_grid
+    def system_of(self, is_on_grid: bool) -> StateSpaceModel:
+        """The user's system; off the grid, with steps of any length."""
+        return self._system if is_on_grid else self._system.at_any_times
 
     def place(self, step: int | None, time: float | None) -> Place:
         """The step and time of a row, and the length of the steps that lead there."""
         if (step is None) == (time is None):
             raise ModelError("give exactly one of step and time")
-        dt, last = self._on_grid.dt, self.step
-        is_on_grid = self.is_on_grid
+        dt, last, is_on_grid = self._system.dt, self.step, self.is_on_grid
         if step is not None:
             if not is_on_grid:
                 raise ModelError("step must be None: the rows so far have times off the grid")
             if not is_integer(step) or step <= last:
                 raise _not_later("step", step, last)
-            return Place(int(step), self._t0 + int(step) * dt, dt)
+            return _checked(Place(int(step), self._t0 + int(step) * dt, dt, True))
         time = check_finite("time", time)
         if time < self.time or (time == self.time and last >= 0):
             raise _not_later("time", time, self.time)
@@ -75,32 +77,26 @@ class RowSteps:
         if is_on_grid and abs(number - round(number)) <= GRID_TOLERANCE:
             if round(number) <= last:
                 raise _not_later("time", time, self.time)
-            return Place(round(number), time, dt)
-        if is_on_grid:
-            self._leave_grid(time)
+            return _checked(Place(round(number), time, dt, True))
+        if (reason := self._system.why_one_length) is not None:
+            raise ModelError(
+                f"time must be t0 + k * {dt:g}, as {reason}, got {time}: choose a dt of which all "
+                "times are multiples"
+            )
         gap = time - self.time
         n_steps = max(math.ceil(gap / dt - GRID_TOLERANCE), 1) if gap > 0.0 else 0
-        return Place(max(last, 0) + n_steps, time, gap / max(n_steps, 1))
-
-    def _leave_grid(self, time: float) -> None:
-        """Give steps lengths of their own from now on."""
-        if (reason := self._on_grid.why_one_length) is not None:
-            raise ModelError(
-                f"time must be t0 + k * {self._on_grid.dt:g}, as {reason}, got {time}: choose a dt "
-                "of which all times are multiples"
-            )
-        self.system = self._on_grid.at_any_times
+        return _checked(Place(max(last, 0) + n_steps, time, gap / max(n_steps, 1), False))
 
     def rows(self, place: Place, inputs: Any) -> InputRows | None:
         """The rows of inputs of the steps since the last row, of all columns; None without any."""
-        system, first = self.system, max(self.step, 0)
+        system, first = self.system_of(place.is_on_grid), max(self.step, 0)
         if not system.n_input_columns and inputs is None:
             return None
         n_steps = place.step - first
         needed = n_steps + int(system.observation_uses_inputs)
         own = _inputs_of_user(system, inputs, needed)
         starts = lengths = None
-        if not self.is_on_grid:
+        if not place.is_on_grid:
             own = np.concatenate([own, own[-1:]] if len(own) == n_steps > 0 else [own])
             own = own if len(own) else np.zeros((1, system.n_inputs))
             starts = self.time + np.arange(len(own)) * place.length
@@ -110,9 +106,22 @@ class RowSteps:
 
     def passed(self, place: Place, datum: Array) -> None:
         """Stand behind a row (p,)."""
-        self.step, self.time = place.step, place.time
-        if self.system.accumulators:
-            self.resets = resets_at(self.system, datum)
+        self.step, self.time, self.is_on_grid = place.step, place.time, place.is_on_grid
+        if self._system.accumulators:
+            self.resets = resets_at(self._system, datum)
+
+
+def numbers_of_row(name: str, value: Any, components: Sequence[str], role: str) -> Array:
+    """The numbers of a row, NaN where missing, in the order of the components if it has labels."""
+    if isinstance(value, pd.Series) and len(components) > 1:
+        value = value.to_frame().T
+    return check_floats(name, columns_in_order(name, value, components, role), None, missing=True)
+
+
+def _checked(place: Place) -> Place:
+    if place.step > MOST_STEPS:
+        raise too_many_steps(place.step)
+    return place
 
 
 def _inputs_of_user(system: StateSpaceModel, inputs: Any, needed: int) -> Array:
@@ -123,7 +132,7 @@ def _inputs_of_user(system: StateSpaceModel, inputs: Any, needed: int) -> Array:
         return np.zeros((needed, system.n_inputs))
     if inputs is None:
         raise ModelError(f"inputs must have values of {list(system.inputs)}, got None")
-    rows = np.asarray(inputs, dtype=np.float64)
+    rows = numbers_of_row("inputs", inputs, system.inputs, "inputs")
     if rows.ndim < 2:
         rows = rows.reshape(-1, 1) if system.n_inputs == 1 else rows.reshape(1, -1)
     if rows.ndim != 2 or rows.shape[1] != system.n_inputs or len(rows) not in (1, needed):

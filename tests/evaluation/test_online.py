@@ -64,6 +64,19 @@ def test_times_on_the_grid_and_off_it(times):
     np.testing.assert_allclose([row.log_likelihood for row in rows], terms, rtol=1e-12)
 
 
+@pytest.mark.parametrize("row", [[0.1, 0.2], [1e200, 0.0]], ids=["prediction", "failure"])
+def test_what_is_not_kept_leaves_the_grid_to_later_rows(row):
+    tracker, other = (psf.online(OSCILLATOR, psf.EKF(), PARAMS) for _ in range(2))
+    for each in (tracker, other):
+        each.update(DATA[0], step=1)
+    tracker.predict(time=0.234)
+    if row[0] > 1.0:
+        with pytest.raises(ModelError, match="has no likelihood"):
+            tracker.update(row, time=0.234)
+    found, expected = (each.update(DATA[1], step=2) for each in (tracker, other))
+    assert found.log_likelihood == expected.log_likelihood
+
+
 def driven(**changes):
     settings = {
         "transition": psf.EulerMaruyama(lambda x, u, a: [u[0] - a * x[0]], [[0.4]], dt=0.5),
@@ -173,46 +186,6 @@ def test_a_state_goes_on_elsewhere(filter, params):
         here, there = (each.update(y, step=k) for each in (tracker, elsewhere))
         np.testing.assert_array_equal(np.hstack([here.log_likelihood, here.mean]),
                                       np.hstack([there.log_likelihood, there.mean]))  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("row", "message"),
-    [
-        ({"observed": 0.1, "step": 3}, "step must be later than the last one, 3, got 3"),
-        ({"observed": 0.1, "step": 1}, "step must be later than the last one, 3, got 1"),
-        ({"observed": 0.1, "time": 3.0}, "time must be later"),
-        ({"observed": 0.1, "step": 4.5}, "step must be an integer from 0 on, got 4.5"),
-        ({"observed": 0.1, "time": 4.5}, "the steps of a transition that is a function have one"),
-        ({"observed": 0.1, "time": np.inf}, "time must be a finite number"),
-        ({"observed": 0.1}, "exactly one of step and time"),
-        ({"observed": np.inf, "step": 4}, "observed must be finite"),
-        ({"observed": np.nan, "step": 4}, "predict gives the state at its time"),
-        ({"observed": [0.1, 0.2], "step": 4}, "observed must have a number for each of"),
-        ({"observed": 0.1, "step": 4, "inputs": [1.0]}, "inputs must be None"),
-        ({"observed": 1e200, "step": 4}, "the row at step 4 has no likelihood"),
-    ],
-)
-def test_a_wrong_row_leaves_the_filter_where_it_was(row, message):
-    tracker, other = (psf.online(ONE_STATE, psf.EKF(), {"a": 0.9}) for _ in range(2))
-    for each in (tracker, other):
-        each.update(0.2, step=3)
-    with pytest.raises(ModelError, match=message):
-        tracker.update(**row)
-    assert tracker.state.step == 3
-    found, expected = (each.update(0.4, step=4) for each in (tracker, other))
-    assert (found.log_likelihood, found.mean) == (expected.log_likelihood, expected.mean)
-
-
-def test_a_state_of_something_else_is_refused():
-    tracker = psf.online(ONE_STATE, psf.EKF(), {"a": 0.9})
-    for system, filter, params, state, message in (
-        (OSCILLATOR, psf.EKF(), PARAMS, tracker.state, "the same system"),
-        (ONE_STATE, psf.UKF(), {"a": 0.9}, tracker.state, "the same system"),
-        (ONE_STATE, psf.EKF(), {"a": 0.8}, tracker.state, "the same parameters"),
-        (ONE_STATE, psf.EKF(), {"a": 0.9}, 3, "state must be that of an online filter"),
-    ):
-        with pytest.raises(ModelError, match=message):
-            psf.online(system, filter, params, state=state)
 
 
 WITHOUT_PYMC = """
