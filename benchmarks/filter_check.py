@@ -23,7 +23,7 @@ import pytensor.tensor as pt
 from scipy.special import logsumexp
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.filter_checks.checks import check_model, outcomes_of
+from pymc_statespace_filters.checks.filters.checks import check_model, outcomes_of
 
 TABLE = Path(__file__).parents[1] / "docs" / "_static" / "filter_check.inc"
 FILTERS = (psf.EKF(), psf.UKF(), psf.IPLF(), psf.EnKF(200), psf.GuidedPF(100))

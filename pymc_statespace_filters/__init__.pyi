@@ -48,7 +48,6 @@ from .plots import (
 )
 from .point_estimation import maximum_likelihood
 from .pymc_model.distribution import StateSpace
-from .rivals import run_models
 from .sampling import (
     DRAM,
     find_starts,
@@ -56,6 +55,7 @@ from .sampling import (
     sample_dram,
     suggest_particles,
 )
+from .several_models import run_models
 from .states import filtered_states, forecast, free_run, smoothed_states
 from .system.drift_processes import OrnsteinUhlenbeck, RandomWalk
 from .system.drifting import drifting

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from ..checks.coverage.check import MOST_PARAMETERS
+from ..checks.coverage.sentences import store, stored, unvisited
 from ..evidence.facts import PartsOfPosterior
 from ..parallel.shared_rows import by_first_rank
 from ..parallel.signals import unless_interrupted
@@ -13,8 +15,6 @@ from ..pymc_model.posterior_draws import (
     unconstrained_draws,
 )
 from ..sampling.output.facts import EndedRun
-from ..unvisited.check import MOST_PARAMETERS
-from ..unvisited.sentences import store, stored, unvisited
 from .signs import signs_message, with_both_signs
 from .step_check import step_problems
 from .words import sentences

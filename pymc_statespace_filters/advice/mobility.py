@@ -4,12 +4,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from ..filters.outcomes import COLLAPSED, Failure
-from ..lower_chains import LowerChain
 from ..sampling.output.chain_bars import MIN_ACCEPT_RATE
 from ..sampling.output.facts import EndedChain, EndedDram
 from ..sampling.output.phase_statistics import PhaseStatistics
 from ..sampling.target.record_target import RecordTarget
 from ..sampling.target.sampled_model import Growth
+from ..statistics.lower_chains import LowerChain
 from .collapse import collapse_remedies
 from .words import sentences
 

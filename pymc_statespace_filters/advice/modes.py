@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pymc.model import Model
 
+from ..checks.coverage import ALL_MODES
 from ..pymc_model.density import ConstrainedValues, ModelDensity
 from ..sampling.output.facts import SeparateModes
 from ..sampling.starts.modes import is_reordered
 from ..sampling.target.variables import RaveledVariables
-from ..unvisited import ALL_MODES
 from .signs import is_symmetric, with_both_signs
 from .words import sentences
 

@@ -9,8 +9,8 @@ from pymc.model import Model
 from pytensor.graph.traversal import ancestors
 from scipy.stats import skew
 
+from ..checks.coverage import ALL_MODES
 from ..pymc_model.inspection import gradient_obstacle, kinked_variable, noisy_filters
-from ..unvisited import ALL_MODES
 
 # A posterior reaches zero if at least this share of the draws is below a tenth of the mean, and if
 # logarithms have this skewness: -1.1 with the exponential distribution, -1.5 with the half-normal,

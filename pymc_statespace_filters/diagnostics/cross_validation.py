@@ -14,12 +14,12 @@ from pymc.model.fgraph import fgraph_from_model, model_from_fgraph
 from scipy.special import logsumexp
 
 from ..errors import INSIDE, EvidenceWarning, ModelError
-from ..importance import largest_good_k, smoothed
 from ..pymc_model.checked_model import checked_model
 from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.state_space_variable import StateSpaceVariable
 from ..states.draws import select_draws
 from ..states.variable import select_variables
+from ..statistics.importance import largest_good_k, smoothed
 from ..system.checks import is_integer
 from .pointwise_log_likelihood import SEQUENTIAL, sequential_terms
 

@@ -7,9 +7,9 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
+from ..checks.filters.checks import stored
+from ..checks.filters.finding import OFF
 from ..errors import INSIDE, FilterWarning
-from ..filter_checks.checks import stored
-from ..filter_checks.finding import OFF
 from ..filters.outcomes import COLLAPSED
 from ..filters.protocol import HealthFilter
 from ..pymc_model.checked_model import checked_model

@@ -7,7 +7,7 @@ import pandas as pd
 import pymc as pm
 import xarray as xr
 
-from ..filter_checks.checks import check_model, outcomes_of, store
+from ..checks.filters.checks import check_model, outcomes_of, store
 from ..filters.protocol import check_filter as check_is_filter
 from ..pymc_model.checked_model import checked_model
 from ..system.checks import check_count, check_flag, check_random_seed

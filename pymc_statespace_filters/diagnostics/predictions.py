@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr, logsumexp, ndtri_exp
 
-from ..pit import pit_of
 from ..pymc_model.observation_moments import Moments, moments_of_observations, moments_on_tape
 from ..pymc_model.state_space_variable import Evaluation, predictions_of, tape_of
 from ..states.record import Array, RecordAtDraws, States
+from ..statistics.pit import pit_of
 from .calibration import residual_limit
 
 # Fewer draws than this behind the probability of a tail, and one of them decides it.

@@ -30,11 +30,11 @@ from scipy.special import softmax
 from scipy.stats import rankdata
 
 from ..errors import ModelError
-from ..lower_chains import lower_chains
 from ..pymc_model.density import RowFunction
 from ..pymc_model.elements import labels_of
 from ..pymc_model.posterior_draws import are_populations
 from ..pymc_model.step_refinement import densities_by_halvings, step_stability
+from ..statistics.lower_chains import lower_chains
 from .observed_data import scalar_count
 from .posterior import Posterior
 

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from ..importance import LogMean, bridge_constant, log_mean, mcse, normalised
+from ..statistics.importance import LogMean, bridge_constant, log_mean, mcse, normalised
 
 Array = NDArray[np.float64]
 

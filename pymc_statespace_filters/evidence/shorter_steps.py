@@ -14,12 +14,19 @@ from pytensor.tensor.variable import TensorVariable
 from scipy.special import logsumexp, softmax
 
 from ..errors import EvidenceWarning
-from ..importance import MAX_PARETO_K, MIN_EFFECTIVE, log_mean_of_draws, mcse, normalised, pareto_k
 from ..progress import row_progress
 from ..pymc_model.checked_model import checked_model
 from ..pymc_model.density import RowFunction, check_free_variables
 from ..pymc_model.posterior_draws import MIN_DRAWS, populations_of, unconstrained_draws
 from ..pymc_model.step_refinement import densities_by_halvings, step_lengths
+from ..statistics.importance import (
+    MAX_PARETO_K,
+    MIN_EFFECTIVE,
+    log_mean_of_draws,
+    mcse,
+    normalised,
+    pareto_k,
+)
 from ..system.checks import check_count, check_random_seed
 
 N_SEEDS = 8  # of a noisy likelihood, at every draw

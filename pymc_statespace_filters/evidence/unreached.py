@@ -13,8 +13,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..importance import log_mean
-from ..lower_chains import TOLERATED
+from ..statistics.importance import log_mean
+from ..statistics.lower_chains import TOLERATED
 from .estimators.newton import BatchFunction, EdgeError, along, derivatives
 from .posterior import Posterior
 

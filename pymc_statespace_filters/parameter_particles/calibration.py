@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from ..compiler.native.python_call import call_machine_code
 from ..evaluation.simulate import observer
-from ..pit import pit_of
 from ..smc.merging import merged_index
 from ..smc.particles import Populations
+from ..statistics.pit import pit_of
 from .observed_rows import ObservedRows
 
 N_PREDICTED = 1000  # draws of the prediction of a row, at most

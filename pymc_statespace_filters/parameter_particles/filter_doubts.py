@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import pymc as pm
 import xarray as xr
 
+from ..checks.filters.checks import kept, store
+from ..checks.filters.facts import FilterOutcomes, UsedFilters
 from ..facts import tell
-from ..filter_checks.checks import kept, store
-from ..filter_checks.facts import FilterOutcomes, UsedFilters
 from ..filters.protocol import Filter
 from ..parallel.shared_rows import by_first_rank
 from .output import DoubtsOf

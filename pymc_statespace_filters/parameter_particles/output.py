@@ -13,11 +13,11 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
+from ..checks.coverage.sentences import store as store_unvisited
 from ..errors import EvidenceWarning
 from ..evidence.evidence import Evidence, store_evidence
 from ..evidence.observed_data import Observed, count_of, fingerprint_of
 from ..filters.protocol import Filter
-from ..importance import normalised
 from ..pymc_model.held_seed import INSIDE
 from ..pymc_model.inspection import exactness, filters_used, noise_seeds
 from ..pymc_model.posterior_draws import BY_PARTICLES, COURSE
@@ -27,7 +27,7 @@ from ..sampling.output.deterministics import Deterministics
 from ..sampling.target.variables import RaveledVariables
 from ..smc.merging import mean_and_error, merged_index, merged_log_evidence
 from ..smc.particles import Particles
-from ..unvisited.sentences import store as store_unvisited
+from ..statistics.importance import normalised
 from .request import Request, Run, least_alive
 
 ESTIMATOR = "smc"

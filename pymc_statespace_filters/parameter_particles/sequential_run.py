@@ -20,11 +20,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..errors import ModelError
-from ..importance import systematic
 from ..parallel.signals import interrupts_are_noted, unless_interrupted
 from ..smc.bridge import Cloud, Crossed, Stage, cross, sizes_of_evidence
 from ..smc.merging import merged_scores
 from ..smc.particles import Populations
+from ..statistics.importance import systematic
 from .calibration import transform_of_row
 from .observed_rows import ObservedRows, exchanged, exchanging
 from .request import Request, Run, check_alive, least_alive

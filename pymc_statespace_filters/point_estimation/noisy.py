@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from ..evidence.estimators.maximum_likelihood import maximize_noisy
 from ..evidence.estimators.newton import BatchFunction, EdgeError
-from ..importance import log_mean_of_independent
 from ..sampling.starts.annealing import Population
+from ..statistics.importance import log_mean_of_independent
 from .estimate import EDGE, HIDDEN, Lost, Peak, unconstrained_hessian
 from .smooth import population_scale, rescaled
 

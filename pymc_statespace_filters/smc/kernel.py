@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ModelError
-from ..student_mixture import (
+from ..statistics.student_mixture import (
     Standardised,
     StudentMixture,
     fit_mixture,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from ..importance import normalised, student_factor, systematic
+from ..statistics.importance import normalised, student_factor, systematic
 from .particles import Populations
 
 Array = NDArray[np.float64]

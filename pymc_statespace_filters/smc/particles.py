@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from ..importance import systematic
+from ..statistics.importance import systematic
 
 Array = NDArray[np.float64]
 

@@ -25,7 +25,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..importance import mcse_of_chains
+from ..statistics.importance import mcse_of_chains
 from .density import Array, Sets
 from .estimates import Sampler, Visits, Weighted
 from .inclusion import InclusionPrior

@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from ..importance import normalised, systematic
+from ..statistics.importance import normalised, systematic
 from .density import Array, Seeds, Sets, SubmodelDensity
 from .estimates import Weighted
 

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from ..evidence.estimators.newton import BatchFunction
-from ..importance import (
+from ..statistics.importance import (
     MIN_EFFECTIVE,
     LogMean,
     largest_good_k,

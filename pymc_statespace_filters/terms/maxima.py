@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..evidence.estimators.newton import BatchFunction, EdgeError, derivatives
-from ..student_mixture import StudentMixture
+from ..statistics.student_mixture import StudentMixture
 from .density import Array, Columns, SubmodelDensity
 from .estimates import Sampler
 from .proposals import FIRST, WIDE, Guide, Proposal

@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..importance import normalised
+from ..statistics.importance import normalised
 from .density import Array, Sets
 
 

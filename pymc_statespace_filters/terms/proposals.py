@@ -20,7 +20,12 @@ import xarray as xr
 from ..errors import ModelError
 from ..evidence.estimators.student_mixture import flattened_copy
 from ..pymc_model.posterior_draws import unconstrained_draws
-from ..student_mixture import StudentMixture, fit_mixture, likeliest_mixture, standardised
+from ..statistics.student_mixture import (
+    StudentMixture,
+    fit_mixture,
+    likeliest_mixture,
+    standardised,
+)
 from .coordinates import Coordinates, fitted_coordinates
 from .density import Array, Columns, Sets, SubmodelDensity
 

@@ -13,9 +13,9 @@ from pymc_statespace_filters.advice.remedies import (
     reaches_zero,
     ways_to_mix,
 )
+from pymc_statespace_filters.checks.coverage import ALL_MODES
 from pymc_statespace_filters.sampling.output.convergence import Convergence
 from pymc_statespace_filters.sampling.output.facts import EndedDram, EndedNuts
-from pymc_statespace_filters.unvisited import ALL_MODES
 
 RNG = np.random.default_rng(0)
 NORMAL = RNG.normal(size=4000)

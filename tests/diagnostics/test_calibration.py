@@ -15,7 +15,7 @@ from pymc_statespace_filters.diagnostics.predictions import (
     calibration_by_rank,
     calibration_of,
 )
-from pymc_statespace_filters.pit import pit_of
+from pymc_statespace_filters.statistics.pit import pit_of
 
 
 def test_the_place_of_a_datum_among_draws():

@@ -8,8 +8,8 @@ import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.checks.filters import checks, estimates
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filter_checks import checks, estimates
 from tests.systems import FREE, autoregression
 
 pytestmark = pytest.mark.usefixtures("interpreted")

@@ -10,9 +10,9 @@ import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.checks.filters.budget import Budget
+from pymc_statespace_filters.checks.filters.estimates import unbiased_witnesses
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.filter_checks.budget import Budget
-from pymc_statespace_filters.filter_checks.estimates import unbiased_witnesses
 from pymc_statespace_filters.pymc_model.filter_estimates import VariableAtPoints
 
 pytestmark = pytest.mark.usefixtures("interpreted")

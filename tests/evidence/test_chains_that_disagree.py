@@ -12,7 +12,7 @@ from pymc_statespace_filters.evidence.checks import check_convergence
 from pymc_statespace_filters.evidence.estimators.bridge import Bridge
 from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import ChibJeliazkov
 from pymc_statespace_filters.evidence.posterior import Posterior
-from pymc_statespace_filters.importance import disagreement, mcse_of_chains
+from pymc_statespace_filters.statistics.importance import disagreement, mcse_of_chains
 from tests.evidence.targets import autoregressive
 
 N_RUNS = 400

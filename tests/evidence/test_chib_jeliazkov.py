@@ -12,7 +12,7 @@ from pymc_statespace_filters.evidence.estimators.chib_jeliazkov import (
     estimate_in_one_block,
 )
 from pymc_statespace_filters.evidence.estimators.random_walk_proposal import plan_proposal
-from pymc_statespace_filters.importance import log_mean_of_draws, log_mean_of_independent
+from pymc_statespace_filters.statistics.importance import log_mean_of_draws, log_mean_of_independent
 from tests.evidence.analytic import Regression, gaussian, half_normal, pilot
 from tests.evidence.calibration import EACH_NUMBER_OF_RUNS, check_scores
 

@@ -19,8 +19,8 @@ from pymc_statespace_filters.evidence.posterior import Posterior
 from pymc_statespace_filters.evidence.reweighting.correction import correct
 from pymc_statespace_filters.evidence.shorter_steps import _change
 from pymc_statespace_filters.facts import sentences
-from pymc_statespace_filters.importance import mcse, mcse_of_populations
 from pymc_statespace_filters.pymc_model.posterior_draws import BY_PARTICLES, populations_of
+from pymc_statespace_filters.statistics.importance import mcse, mcse_of_populations
 from tests.evidence.targets import Regression
 
 R, N, SCATTER = 8, 100, 0.4

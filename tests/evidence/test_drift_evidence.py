@@ -19,9 +19,9 @@ from pymc_statespace_filters.evidence.drift.drift_evidence import _by_width, _ta
 from pymc_statespace_filters.evidence.drift.marginal import ConstantModel, fit_conditionals
 from pymc_statespace_filters.evidence.drift.strengths import StrengthsAtPoints
 from pymc_statespace_filters.evidence.posterior_of_draws import build_posterior, reproducing_seeds
-from pymc_statespace_filters.importance import LogMean, log_mean_of_draws
 from pymc_statespace_filters.pymc_model.density import ModelDensity
 from pymc_statespace_filters.pymc_model.posterior_draws import BY_PARTICLES
+from pymc_statespace_filters.statistics.importance import LogMean, log_mean_of_draws
 from tests.systems import wandering_mean
 
 N_ROWS, MEAN_SD, WIDTH = 12, 2.0, 0.5

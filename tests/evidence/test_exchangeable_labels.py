@@ -9,13 +9,13 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.checks.coverage.sentences import store
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence.exchangeable_labels import OneOrder, undeclared_labels
 from pymc_statespace_filters.evidence.labels import Labels
 from pymc_statespace_filters.evidence.posterior import Posterior
 from pymc_statespace_filters.pymc_model.density import ModelDensity
 from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
-from pymc_statespace_filters.unvisited.sentences import store
 
 DATA = np.array([-2.1, -1.6, -2.4, -1.9, -2.2, 1.8, 2.3, 1.7, 2.0, 2.6])
 ORDERED = pm.distributions.transforms.ordered

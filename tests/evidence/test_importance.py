@@ -7,7 +7,7 @@ import pytest
 
 from pymc_statespace_filters.errors import DataMismatchError
 from pymc_statespace_filters.evidence.estimators.importance import Importance
-from pymc_statespace_filters.importance import pareto_k
+from pymc_statespace_filters.statistics.importance import pareto_k
 from tests.evidence.analytic import gaussian, half_normal
 from tests.evidence.calibration import EACH_NUMBER_OF_RUNS, check_scores
 from tests.evidence.hard_targets import Funnel

@@ -8,7 +8,7 @@ from scipy.stats import multivariate_t
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.estimators.student_mixture import choose_mixture
-from pymc_statespace_filters.student_mixture import (
+from pymc_statespace_filters.statistics.student_mixture import (
     DEGREES_OF_FREEDOM,
     StudentMixture,
     _m_step,

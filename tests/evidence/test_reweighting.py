@@ -13,13 +13,13 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_t, norm
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.checks.filters import checks
+from pymc_statespace_filters.checks.filters.budget import Budget
+from pymc_statespace_filters.checks.filters.finding import Finding
 from pymc_statespace_filters.evidence.pooled import Pooled
 from pymc_statespace_filters.evidence.posterior import Posterior
 from pymc_statespace_filters.evidence.reweighting.correction import correct, seeds_needed
 from pymc_statespace_filters.evidence.reweighting.reweight import _problems
-from pymc_statespace_filters.filter_checks import checks
-from pymc_statespace_filters.filter_checks.budget import Budget
-from pymc_statespace_filters.filter_checks.finding import Finding
 from tests.evidence.targets import Normals, autoregressive, log_normal
 from tests.systems import FREE, counts
 

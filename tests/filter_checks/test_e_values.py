@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from pymc_statespace_filters.filter_checks.e_values import (
+from pymc_statespace_filters.checks.filters.e_values import (
     log_e_values,
     proved_shortfall,
     visible_shortfall,

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.filter_checks.bias import bias_at_draws, bias_elsewhere
-from pymc_statespace_filters.filter_checks.estimates import Comparison, Estimates
-from pymc_statespace_filters.filter_checks.finding import FINE, OFF, UNDECIDED
-from pymc_statespace_filters.filter_checks.low import low_at
-from pymc_statespace_filters.filter_checks.points import Points
+from pymc_statespace_filters.checks.filters.bias import bias_at_draws, bias_elsewhere
+from pymc_statespace_filters.checks.filters.estimates import Comparison, Estimates
+from pymc_statespace_filters.checks.filters.finding import FINE, OFF, UNDECIDED
+from pymc_statespace_filters.checks.filters.low import low_at
+from pymc_statespace_filters.checks.filters.points import Points
 
 PLAIN, GUIDED, MORE = psf.BootstrapPF(1000), psf.GuidedPF(100), psf.GuidedPF(400)
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.checks.coverage.modes import MissedMode
 from pymc_statespace_filters.errors import DataMismatchError
 from pymc_statespace_filters.parameter_particles import stored_steps, whole_data
 from pymc_statespace_filters.parameter_particles.observed_rows import ObservedRows
 from pymc_statespace_filters.parameter_particles.stored_steps import StoredSteps
 from pymc_statespace_filters.parameter_particles.whole_data import WholeLikelihood
-from pymc_statespace_filters.unvisited.modes import MissedMode
 from tests.parameter_particles.autoregression import DATA, model
 
 SETTINGS = {"draws": 20, "populations": 2, "random_seed": 2, "progressbar": False}

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.filter_checks.checks import kept
+from pymc_statespace_filters.checks.filters.checks import kept
 from pymc_statespace_filters.parameter_particles.filter_doubts import kept_from
 from tests.sampling.test_filter_check import N, model_of, outcome_of
 

@@ -50,7 +50,7 @@ from pymc_statespace_filters.sampling.kernel.state import (
 from pymc_statespace_filters.sampling.run.chain_task import ChainTask
 from pymc_statespace_filters.sampling.target.settings import RandomWalkSettings
 from pymc_statespace_filters.sampling.target.target import Target
-from pymc_statespace_filters.student_mixture import DEGREES_OF_FREEDOM, StudentMixture
+from pymc_statespace_filters.statistics.student_mixture import DEGREES_OF_FREEDOM, StudentMixture
 from tests.compiled import from_python
 
 

@@ -14,7 +14,7 @@ import pytest
 from pytensor.compile.ops import wrap_py
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters import rivals as rivals_module
+from pymc_statespace_filters import several_models
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.sampling.checkpoint.record_file import RecordFile, header_of
 from pymc_statespace_filters.sampling.run import model_result
@@ -241,7 +241,7 @@ def test_samplers_and_arguments_of_sample(caplog):
     of_sample = signature(psf.sample).parameters.keys()
     assert (
         of_sample - {"model", "sampler", "continue_from", "checkpoint", "comm"}
-        == (rivals_module._SAMPLERS["auto"][1])
+        == (several_models._SAMPLERS["auto"][1])
     )
     with pytest.raises(TypeError, match=r"argument 'thin': .* those of sample, without model"):
         psf.run_models(rivals, sampler="auto", thin=2)

@@ -6,7 +6,7 @@ import numpy as np
 import pymc as pm
 from scipy.stats import norm
 
-from pymc_statespace_filters.importance import log_mean_of_independent
+from pymc_statespace_filters.statistics.importance import log_mean_of_independent
 from pymc_statespace_filters.terms import enumeration, screening
 from pymc_statespace_filters.terms.candidates import read_candidates
 from pymc_statespace_filters.terms.estimates import Weighted

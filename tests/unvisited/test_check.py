@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pymc_statespace_filters.unvisited import check
-from pymc_statespace_filters.unvisited.check import N_EVALUATIONS, missed_tails
+from pymc_statespace_filters.checks.coverage import check
+from pymc_statespace_filters.checks.coverage.check import N_EVALUATIONS, missed_tails
 from tests.evidence.hard_targets import Correlated, Funnel
 
 ALL = 1e9  # evaluations

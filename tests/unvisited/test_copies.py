@@ -9,7 +9,7 @@ import pytest
 from scipy.special import logsumexp
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.unvisited.copies import LEAPS, missed_copy
+from pymc_statespace_filters.checks.coverage.copies import LEAPS, missed_copy
 
 SD, N = 0.03, 500
 # The modes with their masses; the first is that of the chains, and the second the largest other.

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from pymc_statespace_filters.smc.particles import Particles, Populations
-from pymc_statespace_filters.unvisited import modes
-from pymc_statespace_filters.unvisited.modes import (
+from pymc_statespace_filters.checks.coverage import modes
+from pymc_statespace_filters.checks.coverage.modes import (
     SIZES,
     Visited,
     _integrated,
@@ -14,6 +13,7 @@ from pymc_statespace_filters.unvisited.modes import (
     missed_mode,
     thinned,
 )
+from pymc_statespace_filters.smc.particles import Particles, Populations
 
 R, N, SD = 10, 100, 0.08
 CENTRES, SDS, MASSES = (

@@ -10,8 +10,8 @@ import xarray as xr
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.advice import missed as end_of_run
-from pymc_statespace_filters.unvisited import sentences
-from pymc_statespace_filters.unvisited.sentences import store, stored, unvisited
+from pymc_statespace_filters.checks.coverage import sentences
+from pymc_statespace_filters.checks.coverage.sentences import store, stored, unvisited
 
 N = 2500
 

@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from pymc_statespace_filters.importance import log_mean_of_independent
-from pymc_statespace_filters.unvisited.tail_proposals import Straightened, Tail, weighted_points
+from pymc_statespace_filters.checks.coverage.tail_proposals import (
+    Straightened,
+    Tail,
+    weighted_points,
+)
+from pymc_statespace_filters.statistics.importance import log_mean_of_independent
 from tests.evidence.hard_targets import Correlated, Funnel
 from tests.evidence.targets import autoregressive
 

@@ -29,10 +29,17 @@ from pytensor.tensor.variable import TensorVariable
 
 from ...compiler.native.rows import at_points
 from ...errors import ModelError
-from ...importance import MIN_EFFECTIVE, SAME, log_mean, log_mean_of_draws, mcse, pareto_k
 from ...pymc_model.ends_of_support import bounds_of_support
 from ...pymc_model.posterior_draws import populations_of
 from ...pymc_model.prior import can_sample
+from ...statistics.importance import (
+    MIN_EFFECTIVE,
+    SAME,
+    log_mean,
+    log_mean_of_draws,
+    mcse,
+    pareto_k,
+)
 
 EDGE = 0.05  # fraction of a bounded support, at each end
 # Limits beyond which the reweighted evidence is unreliable.

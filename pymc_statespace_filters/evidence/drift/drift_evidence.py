@@ -12,7 +12,11 @@ from scipy.stats import norm
 
 from ...compiler.native.compilation import COMPILATION
 from ...errors import EvidenceWarning
-from ...importance import (
+from ...progress import row_progress
+from ...pymc_model.density import ModelDensity
+from ...pymc_model.inspection import given_model
+from ...pymc_model.posterior_draws import noise_was_moved, populations_of, posterior_group
+from ...statistics.importance import (
     MIN_EFFECTIVE,
     LogMean,
     disagreement,
@@ -21,10 +25,6 @@ from ...importance import (
     log_mean_of_draws,
     pareto_k,
 )
-from ...progress import row_progress
-from ...pymc_model.density import ModelDensity
-from ...pymc_model.inspection import given_model
-from ...pymc_model.posterior_draws import noise_was_moved, populations_of, posterior_group
 from ...system.checks import check_random_seed
 from ..checks import check_convergence
 from ..comparison.scaled_prior import UNCHANGED, UNKNOWN, ScaledPrior

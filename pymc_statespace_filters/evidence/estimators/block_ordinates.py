@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 from scipy.special import softmax
 
 from ...errors import DataMismatchError
-from ...importance import log_mean, mcse_of_chains, mcse_of_walkers
+from ...statistics.importance import log_mean, mcse_of_chains, mcse_of_walkers
 from ..posterior import Posterior
 from .random_walk_proposal import Proposal
 from .whitening import Whitening

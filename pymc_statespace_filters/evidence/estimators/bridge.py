@@ -42,7 +42,7 @@ from numpy.typing import NDArray
 from scipy.special import expit, log_expit
 from scipy.stats import Covariance, multivariate_normal
 
-from ...importance import (
+from ...statistics.importance import (
     MIN_EFFECTIVE,
     LogMean,
     bridge_constant,

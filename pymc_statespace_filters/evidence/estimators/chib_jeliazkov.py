@@ -40,7 +40,7 @@ from typing import ClassVar
 import numpy as np
 
 from ...errors import ModelError
-from ...importance import (
+from ...statistics.importance import (
     MIN_EFFECTIVE,
     LogMean,
     disagreement,

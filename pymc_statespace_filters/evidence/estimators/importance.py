@@ -27,7 +27,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ...importance import MAX_PARETO_K, MIN_EFFECTIVE, log_mean_of_independent, pareto_k
+from ...statistics.importance import MAX_PARETO_K, MIN_EFFECTIVE, log_mean_of_independent, pareto_k
 from ..posterior import Posterior, check_overlap
 from .protocol import Estimate
 from .stopping import check_target, is_small, shortfall, stands_still, totals

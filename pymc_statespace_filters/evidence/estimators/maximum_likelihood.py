@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
-from ...importance import log_mean_of_independent
+from ...statistics.importance import log_mean_of_independent
 from ..posterior import Posterior, log_likelihood_of
 from .newton import BatchFunction, best_of_chains, newton_maximize
 from .whitening import moments_within_chains

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
 from ...errors import DataMismatchError
-from ...importance import bridge_constant, log_mean, log_mean_of_draws
+from ...statistics.importance import bridge_constant, log_mean, log_mean_of_draws
 from ..posterior import Posterior
 from .stopping import ratio_of_errors
 from .whitening import BLOCK, NormalProposals, Whitening, moments

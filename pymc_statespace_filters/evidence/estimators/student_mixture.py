@@ -7,9 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from ...importance import normalised, systematic
 from ...smc.temperature import next_temperature
-from ...student_mixture import StudentMixture, fit_mixture, place_components, standardised
+from ...statistics.importance import normalised, systematic
+from ...statistics.student_mixture import (
+    StudentMixture,
+    fit_mixture,
+    place_components,
+    standardised,
+)
 from ..posterior import Posterior
 from .whitening import moments
 

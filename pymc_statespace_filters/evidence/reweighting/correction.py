@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from ...importance import MIN_EFFECTIVE, normalised, smoothed, systematic
+from ...statistics.importance import MIN_EFFECTIVE, normalised, smoothed, systematic
 from ..estimators.student_mixture import choose_mixture
 from ..exact_density import ExactDensity, fresh_seeds
 from ..pooled import Pooled

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from ...errors import ModelError
-from ...student_mixture import StudentMixture
+from ...statistics.student_mixture import StudentMixture
 from ..estimators.student_mixture import flattened_copy
 from ..posterior import Posterior
 

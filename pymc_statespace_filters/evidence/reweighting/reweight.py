@@ -15,13 +15,13 @@ from ...errors import INSIDE, EvidenceWarning, FilterWarning, ModelError
 from ...facts import in_words
 from ...filters.protocol import Filter
 from ...filters.written import short_form
-from ...importance import MIN_EFFECTIVE, largest_good_k, pareto_k
 from ...parallel.cpu_affinity import cores_set_to
 from ...progress import row_progress
 from ...pymc_model.density import ModelDensity
 from ...pymc_model.in_step import shared_by_ranks
 from ...pymc_model.other_filter import model_of_draws
 from ...pymc_model.posterior_draws import MIN_DRAWS, noise_was_moved, posterior_group
+from ...statistics.importance import MIN_EFFECTIVE, largest_good_k, pareto_k
 from ...system.checks import check_count, check_random_seed, is_integer
 from ..exact_density import ExactDensity
 from ..facts import CorrectingFilter

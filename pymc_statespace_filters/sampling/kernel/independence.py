@@ -26,7 +26,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from ...compiler.native.jit import linked
-from ...student_mixture import DEGREES_OF_FREEDOM
+from ...statistics.student_mixture import DEGREES_OF_FREEDOM
 
 MOST_COMPONENTS = 9
 

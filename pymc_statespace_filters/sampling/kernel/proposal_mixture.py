@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from ...student_mixture import (
+from ...statistics.student_mixture import (
     DEGREES_OF_FREEDOM,
     StudentMixture,
     fit_mixture,

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...compiler.native.pytensor_function import Call
-from ...student_mixture import DEGREES_OF_FREEDOM
+from ...statistics.student_mixture import DEGREES_OF_FREEDOM
 from .adaptation_state import unpack
 
 HEALTH_SIZE = 3

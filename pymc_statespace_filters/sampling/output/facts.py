@@ -8,7 +8,7 @@ from pymc.model import Model
 from xarray import DataTree
 
 from ...facts import Fact
-from ...lower_chains import LowerChain
+from ...statistics.lower_chains import LowerChain
 from ..run.request import SamplingRequest
 from ..run.stopping import Length
 from ..starts.modes import Points

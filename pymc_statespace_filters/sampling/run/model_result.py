@@ -6,11 +6,11 @@ import numpy as np
 from xarray import DataTree
 
 from ...facts import tell
-from ...lower_chains import lower_chains, nats_below
 from ...parallel.signals import unless_interrupted
 from ...pymc_model.elements import element_names
 from ...pymc_model.inspection import filters_used
 from ...pymc_model.posterior_draws import STATES
+from ...statistics.lower_chains import lower_chains, nats_below
 from ..kernel.state import LOG_DENSITY, ChainState, Draws, side_generator
 from ..output.convergence import Convergence
 from ..output.datatree import to_datatree

@@ -8,7 +8,7 @@ from pymc.model import Model
 
 from ...errors import ModelError
 from ...facts import tell
-from ...student_mixture import standardised
+from ...statistics.student_mixture import standardised
 from ..checkpoint.record_file import RecordFile
 from ..kernel.independence import no_mixture
 from ..kernel.proposal_mixture import fitted_mixture, improved_mixture, warmup_parts

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import ModelError
-from ...importance import systematic
 from ...smc.temperature import next_temperature
+from ...statistics.importance import systematic
 
 # Temperatures; the last of them; its ratio to that of half as many. The ratio is 2 on the way to a
 # posterior far away, and grows by factors in many dimensions: 4 of 1800.

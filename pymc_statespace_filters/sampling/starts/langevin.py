@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...student_mixture import standardised
+from ...statistics.student_mixture import standardised
 
 _MOVES = 4  # of a round, between two looks at the log-density
 _KEPT = 3  # last rounds, of which the points are returned

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from ...student_mixture import fit_mixture, place_components, standardised
+from ...statistics.student_mixture import fit_mixture, place_components, standardised
 
 # With these, at most 120 evaluations of the log-density; the search for starts makes 2560 or more.
 _N_GROUPS = 4

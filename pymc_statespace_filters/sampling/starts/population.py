@@ -29,7 +29,12 @@ from ...errors import ModelError
 from ...filters.outcomes import why_zero
 from ...progress import row_progress
 from ...pymc_model.prior import can_sample
-from ...student_mixture import StudentMixture, fit_mixture, place_components, standardised
+from ...statistics.student_mixture import (
+    StudentMixture,
+    fit_mixture,
+    place_components,
+    standardised,
+)
 from ..kernel.state import draw_seeds
 from ..target.initial_points import N_DRAWS
 from ..target.log_density import LogDensity

@@ -31,12 +31,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from ..importance import LogMean, log_mean_of_truncated, normalised, systematic
-from ..smc.kernel import fitted_mixture
-from ..smc.merging import mean_and_error, merged_index, merged_log_evidence
-from ..smc.particles import Populations
-from ..smc.temperature import next_temperature
-from ..student_mixture import Standardised, StudentMixture, standardised
+from ...smc.kernel import fitted_mixture
+from ...smc.merging import mean_and_error, merged_index, merged_log_evidence
+from ...smc.particles import Populations
+from ...smc.temperature import next_temperature
+from ...statistics.importance import LogMean, log_mean_of_truncated, normalised, systematic
+from ...statistics.student_mixture import Standardised, StudentMixture, standardised
 from .tail_proposals import Evaluate
 
 MIN_EXCESS = math.log(20)  # of the posterior over the mixture, at a point worth a look

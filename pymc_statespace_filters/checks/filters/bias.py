@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, stdtrit
 
-from ..filters.written import short_form
+from ...filters.written import short_form
 from .estimates import Comparison, Estimates
 from .finding import ALPHA, FINE, OFF, TOLERATED, UNDECIDED, VISIBLE, Finding, cure, nats
 from .low import shortfall, without_likelihood

@@ -12,8 +12,8 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
-from ..pymc_model.density import ConstrainedValues
-from ..pymc_model.elements import element_names
+from ...pymc_model.density import ConstrainedValues
+from ...pymc_model.elements import element_names
 from . import ALL_MODES
 from .check import MissedTail, missed_tails
 from .copies import missed_copy

@@ -5,12 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..filters.bootstrap import BootstrapPF
-from ..filters.guided_pf import GuidedPF
-from ..filters.protocol import Filter
-from ..filters.rbpf import RBPF
-from ..filters.written import short_form
-from ..pymc_model.inspection import resized
+from ...filters.bootstrap import BootstrapPF
+from ...filters.guided_pf import GuidedPF
+from ...filters.protocol import Filter
+from ...filters.rbpf import RBPF
+from ...filters.written import short_form
+from ...pymc_model.inspection import resized
 from .estimates import Comparison, Estimates
 
 # The probability at most with which a filter that is right is found to be off.

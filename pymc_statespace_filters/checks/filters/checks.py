@@ -11,19 +11,19 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
-from ..compiler.lowering.compiled_system import compile_system
-from ..errors import ModelError
-from ..filters.bootstrap import BootstrapPF
-from ..filters.checks import check_system_and_filter
-from ..filters.protocol import Filter
-from ..filters.rbpf import RBPF
-from ..filters.written import short_form
-from ..progress import row_progress
-from ..pymc_model.density import compile_raveled
-from ..pymc_model.elements import element_names
-from ..pymc_model.filter_estimates import VariableAtPoints
-from ..pymc_model.inspection import log_density_terms, state_space_nodes
-from ..pymc_model.posterior_draws import posterior_group, unconstrained_draws
+from ...compiler.lowering.compiled_system import compile_system
+from ...errors import ModelError
+from ...filters.bootstrap import BootstrapPF
+from ...filters.checks import check_system_and_filter
+from ...filters.protocol import Filter
+from ...filters.rbpf import RBPF
+from ...filters.written import short_form
+from ...progress import row_progress
+from ...pymc_model.density import compile_raveled
+from ...pymc_model.elements import element_names
+from ...pymc_model.filter_estimates import VariableAtPoints
+from ...pymc_model.inspection import log_density_terms, state_space_nodes
+from ...pymc_model.posterior_draws import posterior_group, unconstrained_draws
 from .bias import bias_at_draws, bias_elsewhere
 from .budget import Budget
 from .estimates import Comparison, compare, is_unbiased

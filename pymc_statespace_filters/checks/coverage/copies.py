@@ -16,9 +16,9 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..importance import LogMean, mcse_of_chains
-from ..smc.kernel import fitted_mixture
-from ..student_mixture import StudentMixture, standardised
+from ...smc.kernel import fitted_mixture
+from ...statistics.importance import LogMean, mcse_of_chains
+from ...statistics.student_mixture import StudentMixture, standardised
 from .check import bridged
 from .modes import MIN_EXCESS, N_PLACES, SIZES, MissedMode, Place, compared, explored
 from .tail_proposals import Evaluate

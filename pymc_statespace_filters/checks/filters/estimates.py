@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from ..compiler.lowering.compiled_system import compile_system
-from ..filters.bootstrap import BootstrapPF
-from ..filters.catalog import exact_filter, filters_for
-from ..filters.guided_pf import GuidedPF
-from ..filters.protocol import Filter
-from ..filters.rbpf import RBPF
-from ..pymc_model.filter_estimates import VariableAtPoints
-from ..pymc_model.inspection import resized
+from ...compiler.lowering.compiled_system import compile_system
+from ...filters.bootstrap import BootstrapPF
+from ...filters.catalog import exact_filter, filters_for
+from ...filters.guided_pf import GuidedPF
+from ...filters.protocol import Filter
+from ...filters.rbpf import RBPF
+from ...pymc_model.filter_estimates import VariableAtPoints
+from ...pymc_model.inspection import resized
 from .budget import Budget
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ guide. Their estimates are unbiased too, and prove the guided ones too low whate
 import numpy as np
 from numpy.typing import NDArray
 
-from ..filters.written import short_form
+from ...filters.written import short_form
 from .e_values import proved_shortfall, visible_shortfall
 from .estimates import Comparison
 from .finding import ALPHA, FINE, OFF, TOLERATED, UNDECIDED, VISIBLE, Finding, cure, nats

@@ -9,8 +9,8 @@ import numpy as np
 import pymc as pm
 from numpy.typing import NDArray
 
-from ..errors import ModelError
-from ..pymc_model.prior import ModelPrior
+from ...errors import ModelError
+from ...pymc_model.prior import ModelPrior
 
 Array = NDArray[np.float64]
 

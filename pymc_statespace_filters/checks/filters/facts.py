@@ -7,8 +7,8 @@ import numpy as np
 from pymc.model import Model
 from xarray import DataTree
 
-from ..facts import Fact
-from ..filters.protocol import Filter
+from ...facts import Fact
+from ...filters.protocol import Filter
 
 
 @dataclass(frozen=True)

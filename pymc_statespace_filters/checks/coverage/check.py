@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import log_expit, stdtrit
 
-from ..importance import (
+from ...statistics.importance import (
     LogMean,
     bridge_constant,
     log_mean_of_draws,

@@ -16,8 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from ..importance import normalised, systematic
-from ..student_mixture import StudentMixture, fit_mixture, place_components, standardised
+from ...statistics.importance import normalised, systematic
+from ...statistics.student_mixture import (
+    StudentMixture,
+    fit_mixture,
+    place_components,
+    standardised,
+)
 
 SHAPE, WIDER = 0.25, 1.5  # of the Pareto distribution; of all scales, relative to the draws
 N_COMPONENTS, N_FITTED = 8, 500  # of the mixture; weighted points and draws that it is fitted to

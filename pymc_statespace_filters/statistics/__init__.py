@@ -1,0 +1,1 @@
+"""Statistics of weights, mixtures, transforms and chains, which know no model."""
