@@ -10,7 +10,7 @@ from ..sampling.output.convergence import MAX_RHAT
 from ..sampling.output.facts import EndedNuts
 from .filter_check import check_filters
 from .missed import missed_of
-from .mixing import until_ess_problem
+from .mixing import mixing_problem, until_ess_problem
 from .remedies import alternatives, reaches_zero, without_transform
 from .words import log, told
 
@@ -51,7 +51,10 @@ def _too_short(fact: EndedNuts, instead: str) -> list[str]:
     if fact.is_stuck:
         slowest = fact.names[0 if fact.convergence is None else int(fact.convergence.rhat.argmax())]
         remedy = f"more iterations do not help draws that diverge: {alternatives(ways(slowest))}"
-    text = until_ess_problem(fact, ways, remedy)
+    if fact.is_complete:
+        text = until_ess_problem(fact, ways, remedy)
+    else:  # the user has ended them
+        text = mixing_problem(fact, ways)
     return [] if text is None else [text]
 
 

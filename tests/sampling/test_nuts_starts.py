@@ -1,4 +1,4 @@
-"""NUTS from points of the user, and what its report says of data that were doubted before."""
+"""NUTS from points of the user, after Ctrl-C, and on data that were doubted before."""
 
 import logging
 
@@ -7,6 +7,7 @@ import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.sampling.nuts import chains
 
 STEPS = np.arange(1, 41)
 WALK = psf.StateSpaceModel(
@@ -57,3 +58,36 @@ def test_no_problems_are_found_only_where_the_data_were_not_doubted(sampler, cap
             psf.sample(1000, sampler=sampler, model=doubted, random_seed=1, progressbar=False)
         said.append("No problems found" in caplog.text)
     assert said == [True, False]
+
+
+@pytest.mark.parametrize(("made", "problem"), [(3, "too small to check"), (2000, None)])
+def test_an_interrupted_run_says_nothing_of_the_limits_that_it_had(
+    made, problem, monkeypatch, caplog
+):
+    """Not that it ended for want of time, nor how many iterations it would have made."""
+    watched = []
+
+    class Watch(chains._Watch):
+        def __init__(self):
+            super().__init__()
+            watched.append(self)
+
+    def is_pressed():
+        finished = [chain.finished_draws for chain in watched[-1].chains]
+        return bool(finished) and min(finished) >= 300 + made
+
+    monkeypatch.setattr(chains, "_Watch", Watch)
+    monkeypatch.setattr(chains, "takes_interrupt", is_pressed)
+    monkeypatch.setattr(chains, "convergence", at_most(made, chains.convergence))
+    idata = psf.sample(
+        10**6, sampler="nuts", model=model(), tune=300, chains=2, random_seed=1, progressbar=False
+    )
+    assert made <= idata["posterior"].sizes["draw"] < 10**6
+    said = [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING]
+    assert len(said) == (problem is not None)
+    assert problem is None or problem in said[0]
+
+
+def at_most(n, convergence):
+    """The diagnostics of the first draws, as chains go on until the run looks at them."""
+    return lambda positions: convergence([each[:n] for each in positions])

@@ -47,6 +47,7 @@ class NutsChains(NamedTuple):
     found: Convergence | None
     seconds: float
     is_stuck: bool  # whether they diverged, and ended as more iterations had not helped
+    is_complete: bool  # whether they have made as many iterations as they were to
 
 
 def run_nuts(
@@ -141,7 +142,12 @@ def _followed(
         for i in range(request.chains):
             bars.extend(i, request.tune + length.n_iterations)
     seconds = time.monotonic() - began
-    return _kept(sampler.abort(), length, found, seconds)._replace(is_stuck=is_stuck)
+    kept = _kept(sampler.abort(), length, found, seconds)._replace(is_stuck=is_stuck)
+    made = kept.positions.shape[1]
+    if made == length.draws:
+        return kept
+    found = convergence(list(kept.positions))
+    return kept._replace(length=length._replace(draws=made), found=found, is_complete=False)
 
 
 def _is_finished(sampler: Any) -> bool:
@@ -185,4 +191,6 @@ def _kept(trace: DataTree, length: Length, found: Convergence | None, seconds: f
     statistics = {
         kept: stats[name].values[:, rows] for name, kept in STATISTICS.items() if name in stats
     }
-    return NutsChains(positions[:, rows], statistics, length, found, seconds, is_stuck=False)
+    return NutsChains(
+        positions[:, rows], statistics, length, found, seconds, is_stuck=False, is_complete=True
+    )

@@ -72,6 +72,7 @@ def sample_nuts(
         energy=chains.statistics["energy"],
         n_steps=chains.statistics["n_steps"],
         is_stuck=chains.is_stuck,
+        is_complete=chains.is_complete,
     )
     tell(ended, of_model(name))
     return tree

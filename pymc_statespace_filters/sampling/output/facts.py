@@ -99,6 +99,8 @@ class EndedRun(ChainFact):
         Draws of the unconstrained space, some of them if they are many.
     rngs : (numpy.random.Generator, numpy.random.Generator)
         For the search of missed parts and the check of filters.
+    is_complete : bool
+        Whether all chains have made as many iterations as they were to.
     is_checked : bool
         Whether the posterior and its filters are to be checked.
     level : str
@@ -118,6 +120,7 @@ class EndedRun(ChainFact):
     convergence: Convergence | None
     positions: np.ndarray
     rngs: tuple[np.random.Generator, np.random.Generator]
+    is_complete: bool
     is_checked: bool
     level: str
 
@@ -130,8 +133,6 @@ class EndedDram(EndedRun):
     ----------
     lengths : sequence of int
         Draws of each chain, with those of the warm-up.
-    is_complete : bool
-        Whether all chains have made as many iterations as they were to.
     chains : mapping
         Those that have draws after the warm-up, by their number.
     lower : sequence of LowerChain
@@ -144,7 +145,6 @@ class EndedDram(EndedRun):
 
     goes_on = True
     lengths: Sequence[int]
-    is_complete: bool
     chains: Mapping[int, EndedChain]
     lower: Sequence[LowerChain]
     below: float | None
