@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytensor
 import pytensor.tensor as pt
-from pytensor.graph.basic import Variable
+from pytensor.graph.basic import Apply, Variable
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.random.type import RandomType
 
@@ -73,7 +73,17 @@ def _parts(system: "StateSpaceModel") -> tuple[list[Variable], list[Variable]]:
 
 def _parameters(draw: Variable) -> Variable:
     """The parameters of all distributions behind a draw, in one vector."""
-    nodes = dict.fromkeys(v.owner for v in ancestors([draw]) if v.owner is not None)
-    drawn = [node for node in nodes if is_drawn(node)]
-    numbers = [v for node in drawn for v in node.inputs if hasattr(v.type, "dtype")]
+    nodes = _nodes_behind(draw)
+    numbers = [
+        v
+        for node in nodes
+        if is_drawn(node)
+        for v in node.inputs
+        # Components of a mixture are drawn themselves, and have parameters of their own.
+        if hasattr(v.type, "dtype") and not any(map(is_drawn, _nodes_behind(v)))
+    ]
     return pt.concatenate([pt.cast(v, "float64").ravel() for v in numbers])
+
+
+def _nodes_behind(variable: Variable) -> list[Apply]:
+    return list(dict.fromkeys(v.owner for v in ancestors([variable]) if v.owner is not None))

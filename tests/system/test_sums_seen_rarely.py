@@ -7,6 +7,7 @@ of the steps since the last row in which it was seen.
 import numpy as np
 import pymc as pm
 import pytensor
+import pytensor.tensor as pt
 import pytest
 from scipy.stats import multivariate_normal
 
@@ -175,11 +176,18 @@ def test_which_observables_read_a_sum():
     )  # fmt: skip
     whole = dict(observation=lambda x: weights @ x, observation_noise=np.eye(2))
     dists = dict(observation_dist=lambda x: [pm.Poisson.dist(abs(x[1])), pm.Normal.dist(0, x[2])])
+    nested = dict(
+        observation_dist=lambda x: [
+            pm.Mixture.dist([0.3, 0.7], pm.Poisson.dist(abs(pt.stack([1.0, x[1]])))),
+            pm.Censored.dist(pm.Normal.dist(x[2], 1.0), lower=None, upper=5.0),
+        ]
+    )
     joint = dict(observation_logp=lambda x, d: -((x[1] + d[0]) ** 2), observables=["a", "b"])
     # An accumulator that no observable reads, such as x2 of the matrix, ends with any of them.
     for seen, expected in (
         (whole, [[1, 0], [1, 1]]),
         (dists, [[0, 1], [1, 0]]),
+        (nested, [[0, 1], [1, 0]]),
         (joint, [[1, 1], [1, 1]]),
     ):
         readers = psf.StateSpaceModel(**settings, **seen).readers
