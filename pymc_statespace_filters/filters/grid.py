@@ -22,25 +22,17 @@ from ..compiler.native.jit import njit_internal
 from ..compiler.native.plan import Plan
 from ..compiler.native.planned_function import PlannedFunction
 from ..errors import ModelError
-from .calls import OK, likelihood_entry
-from .outcomes import NONE
+from .calls import OK, likelihood_entry, state_given
 from .plan import make_plan, read_system, settings_of
-from .point_mass.forward_pass import (
-    END,
-    ON_GRID,
-    ON_SEGMENTS,
-    attempt,
-    discard,
-    first_grid,
-    next_attempt,
-    write_outcome,
-)
+from .point_mass.forward_pass import discard, write_outcome
+from .point_mass.law import STATE_SIZE, law_of_states
 from .point_mass.moments import FILTERED, MOMENTS
 from .point_mass.predictions import GRID_PREDICTIONS
-from .point_mass.segment_pass import discard_segments, pass_on_segments
+from .point_mass.segment_pass import along_record, discard_segments
 from .point_mass.states import GRID_RUN, GRID_STATES
 from .protocol import System, check_sensor_has_noise
 from .signatures import LIKELIHOOD_OF_NOISE, PREDICTIONS, RUN, STATES
+from .state_law import StateLaw
 
 # Beside a kink the error falls with the square of the spacing: 8192 points reach about 1e-6.
 _WITH_KINKS = 1e-5
@@ -82,6 +74,10 @@ class GridFilter:
     a point needs segments in place of the grid, and some eight times as long. Parameters that would
     need more than 8192 points, and observations where the density of the state is below 1e-265, get
     the log-likelihood minus infinity, with that reason.
+
+    A run that goes on begins with the density that was left, down to 1e-40 of its largest value on
+    a grid: terms are those of one run to the tolerance, unless an observation is a greater surprise
+    than that.
 
     Time grows in proportion to the record: 1 to 3 microseconds for a step without an observation
     where some hundred points suffice, 3 to 50 for an observation, the more the finer the sensor is.
@@ -179,7 +175,12 @@ class GridFilter:
         self, system: System, run: EntryPoint, *settings: int, others: Sequence[str] = ()
     ) -> Plan:
         functions = ("step_moments", "log_density", *others)
-        return make_plan(system, run, functions, (self._tolerance_for(system), *settings))
+        tolerance = self._tolerance_for(system)
+        return make_plan(system, run, functions, (tolerance, *settings), state_size=STATE_SIZE)
+
+    def law_of_state(self, system: System, states: np.ndarray) -> StateLaw:
+        """Return the law of the state, from what the filter leaves (m, S) at m points."""
+        return law_of_states(states)
 
     def smoothing_method(self, system: System) -> str:
         """Name the method of the smoothed states."""
@@ -190,28 +191,11 @@ class GridFilter:
 def _point_mass(plan, record, request, seed, to):
     """Write terms and health of one record."""
     system, tolerance = read_system(plan, record.theta, record.inputs), settings_of(plan)[0]
-    code, j = _evaluate(system, record.steps, record.observed, record.t0, tolerance, to.terms)
+    code, j = along_record(
+        system, record, state_given(request), tolerance, to.terms, discard, discard_segments, None
+    )
     write_outcome(code, j, to.terms, to.health)
     return OK
-
-
-@njit_internal
-def _evaluate(system, steps, observed, t0, tolerance, terms):
-    """Write the terms: (NONE, J), or (a reason, the observation that failed)."""
-    if system.failure != NONE:
-        return np.int64(system.failure), np.int64(0)
-    place, settings = ON_GRID, first_grid(system, steps, t0, tolerance)
-    while place != END:
-        if place == ON_SEGMENTS:
-            code, j = pass_on_segments(
-                system, steps, observed, t0, tolerance, terms, discard_segments, None
-            )
-        else:
-            code, j = attempt(
-                system, steps, observed, t0, settings, tolerance, terms, discard, None
-            )
-        place, settings = next_attempt(place, code, settings)
-    return code, j
 
 
 POINT_MASS = likelihood_entry("point_mass", _point_mass)

@@ -25,7 +25,7 @@ class Particles(NamedTuple):
     past: Array  # (n,)
     increment: Array  # (n,)
     seeds: NDArray[np.int64]  # (n, number of seeds)
-    states: Array  # (n, size of a state)
+    states: Array  # (n, size of a state), NaN behind a shorter one
 
     @property
     def log_likelihood(self) -> Array:
@@ -44,11 +44,22 @@ class Particles(NamedTuple):
     def moved(self, mask: NDArray[np.bool_], others: Self) -> Self:
         """These particles, with the ``others``, in turn, where the mask says so."""
         merged: list[Any] = []
-        for old, new in zip(self, others, strict=True):
+        for pair in zip(self, others, strict=True):
+            old, new = _equally_wide(pair)
             values = old.copy()
             values[mask] = new
             merged.append(values)
         return type(self)(*merged)
+
+
+def _equally_wide(arrays: Sequence[NDArray]) -> Sequence[NDArray]:
+    """Arrays with as many columns as the widest: a state of a filter may be longer than another."""
+    widths = {array.shape[1:] for array in arrays}
+    if len(widths) == 1:
+        return arrays
+    ((most,),) = [max(widths)]
+    missing = [((0, 0), (0, most - array.shape[1])) for array in arrays]
+    return [np.pad(a, m, constant_values=np.nan) for a, m in zip(arrays, missing, strict=True)]
 
 
 type Evaluate = Callable[[Array, np.random.Generator], Particles]
@@ -61,7 +72,7 @@ def interleaved(parts: Sequence[Particles]) -> Particles:
     return Particles(
         *(
             np.stack(columns, axis=1).reshape(count, *columns[0].shape[1:])
-            for columns in zip(*parts, strict=True)
+            for columns in map(_equally_wide, zip(*parts, strict=True))
         )
     )
 

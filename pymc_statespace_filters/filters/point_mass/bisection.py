@@ -5,13 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compiler.native.jit import njit_internal
+from ...compiler.native.jit import copy_into, njit_internal
 from ...compiler.numerics.order import stable_order
 from ..observation_failures import observation_failure
 from ..outcomes import GRID_TOO_LARGE, NO_PROCESS_NOISE, NONE, STATE_NOT_FINITE, ZERO_DENSITY
 from ..plan import log_density, step_moments
 from .recursion import TOO_SHORT
-from .segments import MAX_SEGMENTS, POINTS, density, narrowest_within, points_of, tail, weight
+from .segments import MAX_SEGMENTS, POINTS, narrowest_within, points_of, tail, weight
 
 # Of a segment, in standard deviations of the noise: of the step before, and of the next one.
 _WIDEST = 4.0
@@ -83,12 +83,12 @@ def known_point(system, step, x):
 
 
 @njit_internal
-def resolved_segments(system, step, source, accuracy):
-    """(code, segments, log p(d_j | d_1 ..)) of the density ``source`` times the likelihood.
+def resolved_segments(system, step, first_segments, density, source, accuracy):
+    """(code, segments, log p(d_j | d_1 ..)) of the density of ``source`` times the likelihood.
 
     The field ``predicted`` holds densities until the end, then masses.
     """
-    code, segments, n = _first_segments(source)
+    code, segments, n = first_segments(source)
     if code != NONE:
         return code, segments, -np.inf
     fresh = np.arange(n)
@@ -131,7 +131,16 @@ def resolved_segments(system, step, source, accuracy):
 
 
 @njit_internal
-def _first_segments(source):
+def segments_of_law(law):
+    """(code, segments, number): those of a law on segments."""
+    segments, n = empty_segments(MAX_SEGMENTS), law.low.size
+    copy_into(segments.low[:n], law.low)
+    copy_into(segments.high[:n], law.high)
+    return np.int64(NONE), segments, n
+
+
+@njit_internal
+def segments_of_mixture(source):
     """(code, segments, number): as narrow as the noise, where the source reaches."""
     segments, n = empty_segments(MAX_SEGMENTS), 0
     low, high = np.empty(_DEPTH), np.empty(_DEPTH)

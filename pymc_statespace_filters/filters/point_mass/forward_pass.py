@@ -12,12 +12,12 @@ import numpy as np
 from ...compiler.native.jit import inline_always, njit_internal
 from ..outcomes import GRID_TOO_LARGE, NO_PROCESS_NOISE, NONE, TOO_FAR, is_missing
 from ..plan import step_moments
+from .law import AT_START, OF_SEGMENTS, grid_of
 from .recursion import (
     REFINEMENT,
     TOO_COARSE,
     TOO_SHORT,
     empty_table,
-    initial_moments,
     initialise,
     predict,
     update,
@@ -26,7 +26,11 @@ from .recursion import (
 LENGTHENING = 1.6
 # In standard deviations: densities down to 2e-16, and down to 1e-265.
 SHORTEST_REACH, LONGEST_REACH = 8.5, 35.0
+# Of a run that leaves a state: what is cut off here is missing in all rows to come, which may be a
+# surprise. Densities down to 7e-41.
+REACH_OF_STATE = LENGTHENING * SHORTEST_REACH
 _PER_STEP = 1e-5  # planned error of one step, relative to the tolerance
+_COARSER = 1.2  # than planned: the error of a step stays below the tolerance
 # A density that needs more is not smooth, and segments mostly hold it at a fraction of the cost.
 _MOST_REFINEMENTS = 4
 
@@ -49,27 +53,26 @@ def discard(tape, k, grid, updated):
 
 
 @njit_internal
-def first_grid(system, steps, t0, tolerance):
+def _first_grid(system, record, law, tolerance, reach):
     """The settings of the first attempt, with the spacing that the first step requires.
 
-    The step is taken from the initial mean and one standard deviation to either side, see
+    The step is taken from the mean of the law and one standard deviation to either side, see
     `grid.aliasing`.
     """
-    spacing = np.inf
-    if steps.size == 0 or steps[-1] == 0:
-        return Settings(spacing, SHORTEST_REACH, 0, True)
-    mean, sd = initial_moments(system)
+    spacing, steps, (mean, sd) = np.inf, record.steps, (law.mean, law.sd)
+    if steps.size == 0 or steps[-1] == law.k:
+        return Settings(spacing, reach, 0, True)
     X, M = np.empty((1, 3)), np.empty((2, 3))
     for i in range(3):
         X[0, i] = mean + (i - 1) * sd
-    step_moments(system, 0, t0, X, M)
+    step_moments(system, law.k, record.t0 + law.k * system.dt, X, M)
     slope = (M[0, 2] - M[0, 0]) / (2.0 * sd) if sd > 0.0 else 1.0
     for i in range(3):
         width = math.sqrt(M[1, i] / (1.0 + slope * slope))
         if width > 0.0:
             spacing = min(spacing, width)
     spacing = spacing * math.pi * math.sqrt(-2.0 / math.log(_PER_STEP * tolerance))
-    return Settings(spacing, SHORTEST_REACH, 0, True)
+    return Settings(spacing, reach, 0, True)
 
 
 @njit_internal
@@ -94,11 +97,32 @@ def next_attempt(place, code, settings):
 
 
 @njit_internal
-def attempt(system, steps, observed, t0, settings, tolerance, terms, keep, tape):
+def first_attempt(system, record, law, tolerance, leaves_state):
+    """(place, settings) of the first attempt: a law on segments is not put on a grid again."""
+    reach = REACH_OF_STATE if leaves_state else SHORTEST_REACH
+    if law.kind == OF_SEGMENTS:
+        return ON_SEGMENTS, Settings(np.inf, reach, 0, False)
+    return ON_GRID, _first_grid(system, record, law, tolerance, reach)
+
+
+@njit_internal
+def _begin(law, settings):
+    """(code, grid, source) at the step of a law; its own grid is finer if the first step asks."""
+    spacing, reach, n_refined, _ = settings
+    if law.kind == AT_START:
+        return initialise(law.mean, law.sd, spacing, reach)
+    needed = spacing / REFINEMENT**n_refined
+    grid, none = grid_of(law, needed if law.spacing > _COARSER * needed else np.inf), np.empty(0)
+    return np.int64(NONE if grid[2].size else GRID_TOO_LARGE), grid, (none, none, none)
+
+
+@njit_internal
+def attempt(system, record, law, settings, tolerance, terms, keep, tape):
     """Write the terms of one pass; return (NONE, J), or (reason, observation) of a stop."""
+    steps, observed, t0 = record.steps, record.observed, record.t0
     spacing, reach, _, _ = settings
-    k = np.int64(0)
-    code, grid, source = initialise(system, spacing, reach)
+    k = law.k
+    code, grid, source = _begin(law, settings)
     if code == NONE:
         keep(tape, k, grid, False)
     table = empty_table()

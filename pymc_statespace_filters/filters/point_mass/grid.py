@@ -133,9 +133,11 @@ def aliasing(mean, sd, source_spacing, spacing):
 
     As a function of the source, the mass that arrives at a point is a density at least as wide as
     the noise, sd, times a Gaussian of sd over the slope of the mean. The error is the spectrum of
-    this product at 2 pi / spacing. Infinite where there is no noise.
+    this product at 2 pi / spacing, of the coarser grid if the sources are on another one. Infinite
+    where there is no noise.
     """
     n = mean.size
+    spacing = max(source_spacing, spacing) if n > 1 else spacing
     errors = np.zeros(n)
     for i in range(n):
         if not (np.isfinite(mean[i]) and np.isfinite(sd[i])):

@@ -16,11 +16,10 @@ from ...compiler.native.jit import keep_alive, njit_internal
 from ...compiler.native.plan import RECORD, REQUEST, RESULTS, plan_entry
 from ..calls import OK, opened, reals_at, single_record
 from ..outcomes import NONE
-from ..plan import PLAN, observe, read_system, settings_of
-from .forward_pass import END, ON_GRID, ON_SEGMENTS, attempt, first_grid, next_attempt
+from ..plan import PLAN, read_system, settings_of, simulate
 from .grid import grid_points
 from .moments import total_mass
-from .segment_pass import pass_on_segments
+from .segment_pass import along_record
 from .segments import POINTS, points_of
 
 
@@ -40,20 +39,13 @@ def _grid_predictions(plan, record, request, results):
         return status
     J = call.record[RECORD.n_rows]
     data, laws = single_record(call, 0, 0, J), unknown_laws(call)
-    at, observed, t0, tolerance = data.steps, data.observed, data.t0, settings_of(call.plan)[0]
-    system = read_system(call.plan, data.theta, data.inputs)
+    system, tolerance = read_system(call.plan, data.theta, data.inputs), settings_of(call.plan)[0]
     if system.failure != NONE:
         return status
-    place, settings = ON_GRID, first_grid(system, at, t0, tolerance)
-    terms, tape = np.empty(J), (system, at, observed, t0, laws)
-    while place != END:
-        if place == ON_SEGMENTS:
-            code, j = pass_on_segments(
-                system, at, observed, t0, tolerance, terms, _predict_on_segments, tape
-            )
-        else:
-            code, j = attempt(system, at, observed, t0, settings, tolerance, terms, _predict, tape)
-        place, settings = next_attempt(place, code, settings)
+    code, j = along_record(
+        system, data, np.empty(0), tolerance, np.empty(J), _predict, _predict_on_segments,
+        (system, data, laws),
+    )  # fmt: skip
     if code != NONE:
         forget(laws, j)
     return status
@@ -106,16 +98,16 @@ def _write_law(tape, k, X, mass, n_together):
 
     So many points in turn lie beside each other, and the next ones may be elsewhere.
     """
-    system, steps, observed, t0, laws = tape
+    system, record, laws = tape
     if k == 0:  # the first pass, or a repeated one
         laws.next[0] = 0
     j = laws.next[0]
-    if j == steps.size or steps[j] != k:
+    if j == record.steps.size or record.steps[j] != k:
         return
     laws.next[0] = j + 1
-    h, roots = observations_at(system, k, t0 + k * system.dt, X)
+    h, roots = observations_at(system, k, record.t0 + k * system.dt, X)
     weight = 1.0 / total_mass(mass)
-    write_mixture(mass, weight, n_together, h, roots, observed[j], laws, j)
+    write_mixture(mass, weight, n_together, h, roots, record.observed[j], laws, j)
 
 
 @njit_internal
@@ -123,10 +115,10 @@ def observations_at(system, k, t, X):
     """h (p, n) at every point, and what each standard normal adds to it (p, p, n)."""
     p, n = system.p, X.shape[1]
     h, roots, Z = np.empty((p, n)), np.empty((p, p, n)), np.zeros((p, n))
-    observe(system, k, t, Z.ctypes.data, n, X, h)
+    simulate(system, k, t, Z.ctypes.data, n, X, h)
     for a in range(p):
         Z[a, :] = 1.0
-        observe(system, k, t, Z.ctypes.data, n, X, roots[a])
+        simulate(system, k, t, Z.ctypes.data, n, X, roots[a])
         Z[a, :] = 0.0
         for b in range(p):
             for i in range(n):

@@ -92,9 +92,9 @@ def truncation_of(reach):
 
 
 @njit_internal
-def initialise(system, spacing, reach):
+def initialise(mean, sd, spacing, reach):
     """(code, grid, source) at step 0; the source is one Gaussian."""
-    (mean, sd), one = initial_moments(system), np.full(1, 1.0)
+    one = np.full(1, 1.0)
     source = np.full(1, mean), np.full(1, sd), one
     if not (np.isfinite(mean) and np.isfinite(sd)):
         return STATE_NOT_FINITE, (np.int64(0), 1.0, one), source

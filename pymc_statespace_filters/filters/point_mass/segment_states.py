@@ -10,6 +10,7 @@ from ...compiler.numerics.restricted_domain import exp
 from ..outcomes import NONE
 from .bisection import empty_segments
 from .forward_pass import LONGEST_REACH
+from .law import leave_segments, on_segments
 from .moments import PREDICTED, SMOOTHED
 from .recursion import TOO_COARSE, TOO_SHORT
 from .segment_pass import first_accuracy, next_accuracy, pass_from
@@ -19,14 +20,14 @@ _FINER = 1e-10  # the next floor, where smoothed mass lies on segments that were
 
 
 @njit_internal
-def states_on_segments(system, steps, observed, t0, tolerance, moment, rows, stored, terms):
+def states_on_segments(system, record, law, is_wide, tolerance, moment, rows, stored, terms, after):
     """Write rows and terms; return (NONE, J), or (reason, observation) of a failure."""
     kept = [empty_segments(1)]  # lets numba infer the type of the empty list
-    tape, again = (kept, stored), True
-    reach, floor = first_accuracy(tolerance)
+    tape, again, steps, law = (kept, stored, law.k), True, record.steps, on_segments(law)
+    reach, floor = first_accuracy(tolerance, is_wide)
     while again:
         code, j, reach, floor = pass_from(
-            system, steps, observed, t0, reach, floor, tolerance, terms, _keep, tape
+            system, record, law, reach, floor, tolerance, terms, _keep, tape
         )
         if moment == SMOOTHED and code == NONE and rows.at.size:
             code, j = _smooth(steps, floor, tolerance, rows, kept, stored)
@@ -34,14 +35,16 @@ def states_on_segments(system, steps, observed, t0, tolerance, moment, rows, sto
         again = code < NONE
     if moment != SMOOTHED:
         _write_rows(rows, kept, moment)
+        if after.size and code == NONE and stored.size:
+            leave_segments(after, stored[-1], kept[-1])
     return code, j
 
 
 @njit_internal
 def _keep(tape, k, segments):
     """Append the segments of a stored step to the tape, which a repeated pass starts anew."""
-    kept, stored = tape
-    if k == 0:
+    kept, stored, first = tape
+    if k == first:
         kept.clear()
     n = len(kept)
     if n < stored.size and stored[n] == k:

@@ -26,9 +26,9 @@ def _lobatto(n):
     return nodes, 2.0 / (n * (n - 1) * eval_legendre(n - 1, nodes) ** 2)
 
 
-_NODES, _WEIGHTS = _lobatto(POINTS)
+NODES, WEIGHTS = _lobatto(POINTS)
 # Coefficients of the Legendre series of a function on a segment, from its values at the points.
-_SERIES = np.linalg.inv(np.polynomial.legendre.legvander(_NODES, POINTS - 1))
+_SERIES = np.linalg.inv(np.polynomial.legendre.legvander(NODES, POINTS - 1))
 _TAIL = 3  # coefficients that must be small
 
 _ONE_OVER_ROOT_TWO_PI = 1.0 / math.sqrt(2.0 * math.pi)
@@ -92,13 +92,13 @@ def points_of(low, high, out):
     """Write the points of a segment."""
     centre, half = 0.5 * (low + high), 0.5 * (high - low)
     for i in range(POINTS):
-        out[i] = centre + half * _NODES[i]
+        out[i] = centre + half * NODES[i]
 
 
 @njit_internal
 def weight(low, high, i):
     """The quadrature weight of point i."""
-    return 0.5 * (high - low) * _WEIGHTS[i]
+    return 0.5 * (high - low) * WEIGHTS[i]
 
 
 @njit_internal
@@ -126,8 +126,8 @@ def mean_over_gaussian(lows, highs, values, mean, sd, reach):
         centre, half = 0.5 * (lows[p] + highs[p]), 0.5 * (highs[p] - lows[p])
         part = 0.0
         for b in range(POINTS):
-            z = (centre + half * _NODES[b] - mean) * precision
-            part += _WEIGHTS[b] * exp(-0.5 * z * z) * values[p, b]
+            z = (centre + half * NODES[b] - mean) * precision
+            part += WEIGHTS[b] * exp(-0.5 * z * z) * values[p, b]
         result += half * part
     return result * precision * _ONE_OVER_ROOT_TWO_PI
 
@@ -142,6 +142,19 @@ def tail(values):
             coefficient += _SERIES[degree, i] * values[i]
         largest = max(largest, abs(coefficient))
     return largest
+
+
+@njit_internal
+def polynomial(values, v):
+    """The polynomial through values at the points of a segment, at a place v in [-1, 1]."""
+    total, before, now = 0.0, 0.0, 1.0
+    for degree in range(POINTS):
+        coefficient = 0.0
+        for i in range(POINTS):
+            coefficient += _SERIES[degree, i] * values[i]
+        total += coefficient * now
+        before, now = now, ((2 * degree + 1) * v * now - degree * before) / (degree + 1)
+    return total
 
 
 @njit_internal
@@ -185,7 +198,7 @@ def _position(mass, wanted):
     series = np.zeros(POINTS)
     for degree in range(POINTS):
         for i in range(POINTS):
-            series[degree] += _SERIES[degree, i] * mass[i] / _WEIGHTS[i]
+            series[degree] += _SERIES[degree, i] * mass[i] / WEIGHTS[i]
     low, high = -1.0, 1.0
     for _ in range(_HALVINGS):
         v = 0.5 * (low + high)

@@ -19,22 +19,32 @@ import math
 import numpy as np
 
 from ...compiler.native.jit import inline_always, njit_internal
-from ...compiler.native.plan import HEALTH_SIZE, RECORD, REQUEST, RESULTS, plan_entry
+from ...compiler.native.plan import HEALTH_SIZE, RECORD, REQUEST, RESULTS, STATE, plan_entry
 from ...compiler.numerics.philox import STATES, uniform_at
 from ...compiler.numerics.restricted_domain import exp
-from ..calls import OK, opened, reals_at, single_record, wanted_rows
-from ..outcomes import NONE, OUT_OF_MEMORY, is_missing
+from ..calls import (
+    ALL_STEPS,
+    OK,
+    integers_at,
+    opened,
+    reals_at,
+    single_record,
+    state_given,
+    state_wanted,
+    wanted_rows,
+)
+from ..outcomes import GRID_TOO_LARGE, NONE, OUT_OF_MEMORY, is_missing
 from ..plan import log_density, read_system, settings_of
 from .forward_pass import (
     END,
-    ON_GRID,
     ON_SEGMENTS,
     attempt,
-    first_grid,
+    first_attempt,
     next_attempt,
     write_outcome,
 )
 from .grid import gather, grid_points
+from .law import is_law, law_before, leave_grid
 from .moments import PREDICTED, SMOOTHED, Rows, draw, mean_and_sd, total_mass
 from .recursion import TOO_SHORT, empty_table, transition_at, with_sources
 from .segment_states import states_on_segments
@@ -56,9 +66,7 @@ def _write_moments(call, rows, drawn):
     mean[:], sd[:], drawn[:], terms[:] = np.nan, np.nan, np.nan, -np.inf
     health[0], health[1], health[2] = np.inf, OUT_OF_MEMORY, 0.0
     wanted = Rows(rows, call.request[REQUEST.draw_seed], mean, sd, drawn)
-    code, j = _evaluate(
-        system, data.steps, data.observed, data.t0, tolerance, moment, wanted, terms
-    )
+    code, j = _evaluate(call, system, data, tolerance, moment, wanted, terms)
     for i in range(rows.size):
         if code != NONE and (moment == SMOOTHED or j == 0 or rows[i] >= data.steps[j]):
             mean[i], sd[i], drawn[i] = np.nan, np.nan, np.nan
@@ -79,10 +87,19 @@ def _grid_states(plan, record, request, results):
     return status
 
 
+@njit_internal
+def _first_step(call):
+    """The step of the first row."""
+    return integers_at(call.record[RECORD.rows], 1)[0] if call.record[RECORD.n_rows] else ALL_STEPS
+
+
 def _grid_run(plan, record, request, results):
     status, call = opened(plan, record, request, results)
     if status != OK or call.request[REQUEST.sizes_only]:
         return status
+    before = state_given(call.request)
+    if before.size and not (is_law(before) and before[0] < _first_step(call)):
+        return np.int64(STATE)
     rows = wanted_rows(call)
     sd = _write_moments(call, rows, np.empty(rows.size))
     cov = reals_at(call.results[RESULTS.cov], (rows.size,))
@@ -92,38 +109,49 @@ def _grid_run(plan, record, request, results):
 
 
 @njit_internal
-def _evaluate(system, steps, observed, t0, tolerance, moment, rows, terms):
-    """Write rows and terms; return (NONE, J), or (reason, observation) of a failure."""
+def _evaluate(call, system, record, tolerance, moment, rows, terms):
+    """Write rows, terms and the state left; return (NONE, J), or (reason, observation)."""
+    before, after = state_given(call.request), state_wanted(call)
+    if after.size:
+        after[:] = np.nan
     if system.failure != NONE:
         return np.int64(system.failure), np.int64(0)
-    stored = rows.at
+    stored, steps = rows.at, record.steps
     if moment == SMOOTHED and rows.at.size:
         stored = np.arange(rows.at[0], steps[-1] + 1)
-    place, settings = ON_GRID, first_grid(system, steps, t0, tolerance)
+    elif after.size and steps.size and not (rows.at.size and rows.at[-1] == steps[-1]):
+        stored = np.append(rows.at, steps[-1])
+    law, is_wide = law_before(system, before), after.size > 0
+    place, settings = first_attempt(system, record, law, tolerance, is_wide)
     while place != END:
         if place == ON_SEGMENTS:
             code, j = states_on_segments(
-                system, steps, observed, t0, tolerance, moment, rows, stored, terms
+                system, record, law, is_wide, tolerance, moment, rows, stored, terms, after
             )
         else:
             code, j = _states_on_grid(
-                system, steps, observed, t0, settings, tolerance, moment, rows, stored, terms
+                system, record, law, settings, tolerance, moment, rows, stored, terms, after
             )
         place, settings = next_attempt(place, code, settings)
+        if place == END and code == GRID_TOO_LARGE and is_wide:
+            is_wide = False
+            place, settings = first_attempt(system, record, law, tolerance, is_wide)
     return code, j
 
 
 @njit_internal
-def _states_on_grid(system, steps, observed, t0, settings, tolerance, moment, rows, stored, terms):
+def _states_on_grid(system, record, law, settings, tolerance, moment, rows, stored, terms, after):
     """One attempt: write rows and terms; return (NONE, J), or (reason, observation) of a stop."""
     grids = [(np.int64(0), 1.0, terms)]  # lets numba infer the type of the empty list
     grids.clear()
     tape = grids, stored, moment
-    code, j = attempt(system, steps, observed, t0, settings, tolerance, terms, _keep, tape)
+    code, j = attempt(system, record, law, settings, tolerance, terms, _keep, tape)
     if moment != SMOOTHED:
         _write_rows(rows, grids)
+        if after.size and code == NONE and grids:
+            leave_grid(after, stored[-1], grids[-1])
     elif code == NONE and rows.at.size:
-        code, j = _smooth(system, steps, observed, t0, settings, tolerance, terms, tape, rows)
+        code, j = _smooth(system, record, settings, tolerance, terms, tape, rows)
     return code, j
 
 
@@ -153,8 +181,9 @@ def _write_rows(rows, grids):
 
 
 @njit_internal
-def _smooth(system, steps, observed, t0, settings, tolerance, terms, tape, rows):
+def _smooth(system, record, settings, tolerance, terms, tape, rows):
     """Write the smoothed rows in a backward pass; return (NONE, J), or (reason, observation)."""
+    steps, observed, t0 = record.steps, record.observed, record.t0
     spacing, reach, _, _ = settings
     grids, stored, _ = tape
     table, later = empty_table(), grids[-1]
