@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..errors import ModelError
 from ..filters.checks import check_system_and_filter, tell_of_choice
 from ..filters.outcomes import NONE, Failure
-from ..filters.protocol import Filter, properties
+from ..filters.protocol import Filter, ResumableFilter
 from ..system.checks import check_finite, check_random_seed
 from ..system.model import StateSpaceModel
 from ..system.parameters import flat_parameters
@@ -256,7 +256,7 @@ def online(
     """
     check_system_and_filter(system, filter)
     tell_of_choice(system, filter)
-    if not properties(filter).resumes:
+    if not isinstance(filter, ResumableFilter):
         raise ModelError(f"{type(filter).__name__} cannot go on from its state")
     theta = np.atleast_2d(flat_parameters(system, params))
     if theta.ndim != 2 or not len(theta):

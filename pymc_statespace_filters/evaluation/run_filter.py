@@ -12,7 +12,7 @@ import xarray as xr
 from ..compiler.numerics.philox import seeds_of_records
 from ..errors import ModelError
 from ..filters.checks import check_system_and_filter, tell_of_choice
-from ..filters.protocol import Filter, check_states_filter, properties
+from ..filters.protocol import Filter, ResumableFilter, check_states_filter, properties
 from ..ops.base import evaluator
 from ..ops.states import FilterRun, ResumableRun, States
 from ..system.clock import Clock
@@ -68,7 +68,9 @@ def run_filter(
         An earlier run, of the same system, filter, parameters, seed and t0, that goes on with these
         rows. Steps and times count from the old step 0 and come after the last old row; ``inputs``
         cover old and new steps; of a panel, every record goes on. Terms and states are those of one
-        run over all rows, bit for bit (`FiniteStateFilter`: to rounding).
+        run over all rows, bit for bit (`FiniteStateFilter`: to rounding; `GridFilter`: to its
+        tolerance). `GuidedPF` looks ahead at the rows that it is given: its terms are those of a
+        run in the same parts, and its estimate is unbiased in any parts.
 
     Returns
     -------
@@ -85,8 +87,7 @@ def run_filter(
         ``time``, with the coordinates ``record``, ``step`` and ``time`` of each row, the records
         one below the other; that of ``log_likelihood`` is ``obs``, with ``obs_record``,
         ``obs_step`` and ``obs_time``. ``filter_state`` is what the filter goes on from with
-        ``state``, a vector, or one for each record of a panel; `GuidedPF`, which needs the record
-        ahead, and `GridFilter` have none.
+        ``state``, a vector, or one for each record of a panel.
 
     Raises
     ------
@@ -172,7 +173,7 @@ def run_filter(
     at_steps = [each[1] for each in arguments]
     rows = [own[own >= k] for own, k in zip((rows_at(at, s) for s in at_steps), first, strict=True)]
     left: list[np.ndarray] = []
-    if properties(filter).resumes:
+    if isinstance(filter, ResumableFilter):
         evaluate = evaluator(ResumableRun(system, filter))
         parts = zip(arguments, rows, before, strict=True)
         found = [evaluate(*each, own, start) for each, own, start in parts]
@@ -267,13 +268,10 @@ def states_before(
         If the filter cannot go on, or the earlier run is not one of the same filter, system,
         parameters, seed and records, or failed.
     """
-    of_filter = properties(filter)
-    if not of_filter.resumes:
-        why = "it has no state that holds for the rows to come"
-        if of_filter.needs_record_ahead:
-            why = "its guide needs the record ahead"
+    if not isinstance(filter, ResumableFilter):
         raise ModelError(
-            f"{type(filter).__name__} cannot go on from an earlier run: {why}; run it over all rows"
+            f"{type(filter).__name__} cannot go on from an earlier run: it has no state that holds "
+            "for the rows to come; run it over all rows"
         )
     if not isinstance(state, xr.Dataset) or STATE not in state:
         raise ModelError(f"state must be what run_filter returned, got {type(state).__name__}")

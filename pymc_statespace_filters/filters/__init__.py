@@ -1,7 +1,7 @@
 """The filters, and what your own filter needs: the contract in `protocol`, and base classes.
 
-`EnsembleFilterBase` and `ParticleFilter` with `ensemble_filter` and `particle_filter` give a filter
-with members everything but its update; a filter of another kind satisfies `Filter` by itself.
+`EnsembleFilterBase` and `ParticleFilter` with `member_filter` give a filter with members everything
+but its update; a filter of another kind satisfies `Filter` by itself.
 """
 
 import lazy_loader

@@ -2,8 +2,8 @@ from .bootstrap import BootstrapPF
 from .ekf import EKF
 from .enkf import EnKF
 from .ensemble.base import EnsembleFilterBase
-from .ensemble.loop import Outcome, ensemble_filter, failed
-from .ensemble.particle_filter import ParticleFilter, particle_filter
+from .ensemble.loop import Outcome, failed, member_filter
+from .ensemble.particle_filter import ParticleFilter
 from .finite_state import FiniteStateFilter
 from .grid import GridFilter
 from .guided_pf import GuidedPF
@@ -52,7 +52,6 @@ __all__ = [
     "StatesFilter",
     "System",
     "ToleranceFilter",
-    "ensemble_filter",
     "failed",
-    "particle_filter",
+    "member_filter",
 ]

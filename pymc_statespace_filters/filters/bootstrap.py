@@ -6,38 +6,33 @@ from typing import ClassVar
 import numpy as np
 
 from ..compiler.native.entry_point import EntryPoint
-from ..compiler.native.jit import njit_internal
+from ..compiler.native.jit import inline_always
 from .ensemble.failures import failure_of_all
 from .ensemble.kalman_update import mark_finite
-from .ensemble.loop import Outcome, failed
-from .ensemble.particle_filter import ParticleFilter, particle_filter
+from .ensemble.loop import Outcome, failed, member_filter, time_of
+from .ensemble.particle_filter import ParticleFilter
 from .ensemble.weights import normalise_weights
 from .outcomes import NONE
 from .plan import log_density
 
 
-@njit_internal
-def workspace(system, local, settings):
-    """Nothing: the update needs no scratch."""
-    return ()
-
-
-@njit_internal
-def update(system, j, k, t, d, noise, members, local, work):
+@inline_always
+def observe(call, j, k, parts):
     """Weight the particles by the density of the observation."""
+    members, t, d = parts.members, time_of(call, k), call.record.observed[j]
     X, w, log_w, alive = members.X, members.w, members.log_w, members.alive
 
     # Weights (Eq. 4.28); log_w holds the normalised weights of the previous observation
     mark_finite(X, X, alive)
-    log_density(system, k, t, d, X, members.log_p)
+    log_density(call.system, k, t, d, X, members.log_p)
     for i in range(alive.size):
         alive[i] &= log_w[i] > -np.inf
         log_w[i] = log_w[i] + members.log_p[i] if alive[i] else -np.inf
 
     # Increment of the log-likelihood and effective number (Eq. 4.43)
-    increment, n_effective = normalise_weights(log_w, w, local)
+    increment, n_effective = normalise_weights(log_w, w, call.local)
     if increment == -np.inf:
-        return failed(failure_of_all(system, k, t, d, members, local))
+        return failed(failure_of_all(call.system, k, t, d, members, call.local))
     return Outcome(increment, n_effective, n_effective, NONE)
 
 
@@ -82,4 +77,4 @@ class BootstrapPF(ParticleFilter):
 
     unbiased: ClassVar[bool] = True
     counts_copies: ClassVar[bool] = True
-    entry: ClassVar[EntryPoint] = particle_filter("bootstrap_pf", workspace, update)
+    entry: ClassVar[EntryPoint] = member_filter("bootstrap_pf", observe)

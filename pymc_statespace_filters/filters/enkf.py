@@ -8,7 +8,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from ..compiler.native.entry_point import EntryPoint
-from ..compiler.native.jit import njit_internal
+from ..compiler.native.jit import inline_always, njit_internal
 from ..compiler.native.plan import Plan
 from ..compiler.numerics.small_cholesky import log_gaussian
 from ..errors import ModelError
@@ -24,19 +24,21 @@ from .ensemble.kalman_update import (
     mark_finite,
     moments_workspace,
 )
-from .ensemble.loop import Outcome, ensemble_filter, failed
+from .ensemble.loop import Members, Outcome, failed, member_filter, time_of
+from .ensemble.loop import start as start_members
 from .ensemble.noise import NoiseSizes, observation_normals
 from .outcomes import NONE, SINGULAR
-from .plan import log_density, observe
+from .plan import log_density, simulate
 from .protocol import System
 
 _LIKELIHOODS = ("ensemble", "gaussian")
 _ENSEMBLE = 0
 
 
-class _Work(NamedTuple):
-    """The choice of the likelihood, and scratch of one update."""
+class Parts(NamedTuple):
+    """The members, the choice of the likelihood, and scratch of one update."""
 
+    members: Members
     is_ensemble: bool
     moments: Moments
     log_terms: np.ndarray
@@ -45,30 +47,37 @@ class _Work(NamedTuple):
 
 
 @njit_internal
-def workspace(system, local, settings):
-    """Scratch of an update."""
-    moments = moments_workspace(system.n, system.p)
-    N = local.size
-    return _Work(settings[0] == _ENSEMBLE, moments, np.empty(N), np.empty(N), np.empty(system.p))
+def start(call):
+    """Draw the members or take those of a state; the step, and the parts."""
+    k, (members,) = start_members(call)
+    n, p, N = call.system.n, call.system.p, call.local.size
+    return k, Parts(
+        members=members, is_ensemble=call.settings[0] == _ENSEMBLE,
+        moments=moments_workspace(n, p), log_terms=np.empty(N), terms=np.empty(N),
+        residual=np.empty(p),
+    )  # fmt: skip
 
 
-@njit_internal
-def update(system, j, k, t, d, noise, members, local, work):
+@inline_always
+def observe(call, j, k, parts):
     """Move the members by the Kalman gain of their own covariances."""
-    X, D, w, alive, moments = members.X, members.D, members.w, members.alive, work.moments
+    system, local, t, d = call.system, call.local, time_of(call, k), call.record.observed[j]
+    members, moments = parts.members, parts.moments
+    X, D, w, alive = members.X, members.D, members.w, members.alive
 
     # Simulated observations (Eq. 4.15)
-    observe(system, k, t, observation_normals(noise, j, k), noise.sizes.width, X, D)
+    z = observation_normals(call.noise, j, k)
+    simulate(system, k, t, z, local.width, X, D)
     mark_finite(X, D, alive)
     for i in range(w.size):
         w[i] = 1.0 if alive[i] else 0.0
 
     # Moments of the forecast (Eqs. 4.16-4.19), and the mean of p(d | x^f_i)
-    if work.is_ensemble:
+    if parts.is_ensemble:
         log_density(system, k, t, d, X, members.log_p)
-        _fill_log_terms(members, local, work)
-    log_terms, terms = work.log_terms, work.terms
-    forecast = forecast_means(members, log_terms, terms, work.is_ensemble, local, moments, False)
+        _fill_log_terms(members, local, parts)
+    log_terms, terms = parts.log_terms, parts.terms
+    forecast = forecast_means(members, log_terms, terms, parts.is_ensemble, local, moments, False)
     n_alive = forecast.n_alive
     if n_alive == 0.0:
         mark_finite(X, X, alive)
@@ -78,8 +87,8 @@ def update(system, j, k, t, d, noise, members, local, work):
 
     # Increment of the log-likelihood, and how many members carry it (Eq. 4.43)
     increment, n_effective = forecast.log_sum, forecast.n_effective  # Eq. 4.26
-    if not work.is_ensemble:
-        increment, n_effective = _gaussian_likelihood(d, work), n_alive
+    if not parts.is_ensemble:
+        increment, n_effective = _gaussian_likelihood(d, parts), n_alive
     if not np.isfinite(increment):
         mark_finite(X, X, alive)
         return failed(failure_of_all(system, k, t, d, members, local))
@@ -90,17 +99,17 @@ def update(system, j, k, t, d, noise, members, local, work):
 
 
 @njit_internal
-def _fill_log_terms(members, local, work):
+def _fill_log_terms(members, local, parts):
     """Write log p(d | x^f_i) / N of every member; zero for those that are not alive."""
     log_N = math.log(local.n_members)
     for i in range(members.alive.size):
-        work.log_terms[i] = members.log_p[i] - log_N if members.alive[i] else -np.inf
+        parts.log_terms[i] = members.log_p[i] - log_N if members.alive[i] else -np.inf
 
 
 @njit_internal
-def _gaussian_likelihood(d, work):
+def _gaussian_likelihood(d, parts):
     """log N(d; d_bar, P_dd), observed components only."""
-    moments, residual, n_present = work.moments, work.residual, 0
+    moments, residual, n_present = parts.moments, parts.residual, 0
     for b in range(d.size):
         present = not np.isnan(d[b])
         residual[b] = d[b] - moments.d_mean[b] if present else 0.0
@@ -150,7 +159,7 @@ class EnKF(EnsembleFilterBase):
     likelihood: str = "ensemble"
 
     simulates: ClassVar[bool] = True
-    entry: ClassVar[EntryPoint] = ensemble_filter("enkf", workspace, update, n_settings=1)
+    entry: ClassVar[EntryPoint] = member_filter("enkf", observe, start=start)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "n_members", check_count("n_members", self.n_members))
@@ -160,7 +169,7 @@ class EnKF(EnsembleFilterBase):
         """Return the number of members."""
         return self.n_members
 
-    def settings(self) -> tuple[float, ...]:
+    def settings(self, system: System) -> tuple[float, ...]:
         """Return the number of the likelihood."""
         return (_LIKELIHOODS.index(self.likelihood),)
 

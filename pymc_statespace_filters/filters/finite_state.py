@@ -87,7 +87,6 @@ class FiniteStateFilter(TapedFilter):
     declared: Declared = field(default=(), init=False, repr=False)
 
     finds_path: ClassVar[bool] = True
-    resumes: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         given = {} if self.values is None else self.values

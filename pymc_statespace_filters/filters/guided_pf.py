@@ -13,107 +13,99 @@ from typing import ClassVar
 import numpy as np
 
 from ..compiler.native.entry_point import EntryPoint
-from ..compiler.native.jit import njit_internal
-from ..compiler.native.plan import NORMALS, Plan
-from ..compiler.numerics.normals import FILL_NORMALS
+from ..compiler.native.jit import inline_always, njit_internal
+from ..compiler.native.plan import Plan
 from ..errors import ModelError
-from .bootstrap import update
-from .calls import OK, likelihood_entry
-from .ensemble.callbacks import ENDED, RESAMPLED, UPDATED, emit
-from .ensemble.defence import choose_unguided, least_share, place_of_unguided, share_at_start
-from .ensemble.guide import make_guide
+from .bootstrap import observe
+from .ensemble.defence import choose_unguided, least_share, share_at_start
+from .ensemble.guide import initial_law, law_of_particles, make_guide
 from .ensemble.guided_moves import (
     begin_interval,
-    emit_forecast,
+    draw_start,
     guided_particles,
     look_ahead,
     move,
     resample_ahead,
-    start,
+    show_forecast,
     weigh_moves,
 )
-from .ensemble.guided_predictions import copy_again, predict, start_copies
-from .ensemble.loop import N_LEADING, n_sums, noise_of_rank, observer_of, rank_of
-from .ensemble.noise import initial_rows, resampling_normals
+from .ensemble.guided_predictions import copy_again, move_copies, start_copies
+from .ensemble.kalman_update import mark_finite
+from .ensemble.loop import Outcome, Plain, failed, member_filter, new_members, restore
 from .ensemble.particle_filter import ParticleFilter
-from .ensemble.pilot import judge
-from .ensemble.reductions import local_partition
-from .ensemble.resampling import resampler
-from .outcomes import NONE, is_missing
-from .plan import PLAN, read_system, settings_of
+from .ensemble.pilot import chosen_for_pilot, judge
+from .ensemble.weights import normalise_weights
+from .outcomes import NONE
+from .plan import PLAN
 from .protocol import System
 
 
 @njit_internal
-def _unguided_shares(plan, system, record, guide):
-    """The share (J + 1,) of unguided particles before every observation and after the last."""
-    J = record.steps.size
-    shares = np.zeros(J + 1)
-    if plan[PLAN.is_linear]:
-        return shares
-    judge(system, record, guide, update, shares)
-    for j in range(J):
-        shares[j] = max(shares[j], least_share(guide, j))
-    return shares
-
-
-@njit_internal
-def _evaluate(plan, record, request, seed, to):
-    given, steps, dt = settings_of(plan), record.steps, plan.view(np.float64)[PLAN.dt]
-    system = read_system(plan, record.theta, record.inputs)
-    local = local_partition(rank_of(request), int(given[0]), n_sums(system))
-    noise, fits = noise_of_rank(seed, request, given, steps, local)
-    if not fits:
-        return NORMALS
-    if system.failure != NONE:
-        to.health[0], to.health[1], to.health[2] = 0.0, system.failure, 0.0
-        return OK
-    scheme = int(given[N_LEADING + 1])
-    resampling = resampler(given[N_LEADING], scheme, plan[PLAN.order], system.n, local)
-    particles = guided_particles(system.n, system.m, system.p, local)
-    guide = make_guide(system, record)
-    members, observer, health = particles.members, observer_of(request), to.health
-    health[0], health[1], health[2] = given[0], NONE, -1
-    nothing, ancestors = np.empty(0), resampling.ancestors
-    k = np.int64(0)
-    shares = _unguided_shares(plan, system, record, guide)
+def _start(call):
+    """Make the guide of the rows given; draw particles, or weigh those of a state by psi."""
+    system, record, local = call.system, call.record, call.local
+    members, goes_on = new_members(system.n, system.p, local), call.state.size > 0
+    if goes_on:
+        k = restore(call, members)
+        mark_finite(members.X, members.X, members.alive)
+        normalise_weights(members.log_w, members.w, local)
+        beginning = law_of_particles(system, k, members.w, members.X, local)
+        of_pilot = chosen_for_pilot(members.w, members.X, local)
+    else:
+        k, beginning, of_pilot = np.int64(0), initial_law(system), np.empty((system.n, 0))
+    guide, shares = make_guide(system, record, beginning), np.zeros(record.steps.size + 1)
+    if not call.plan[PLAN.is_linear]:
+        judge(call, guide, observe, k, of_pilot, shares)
+        for j in range(record.steps.size):
+            shares[j] = max(shares[j], least_share(guide, j))
+    particles = guided_particles(call, members, guide, shares)
+    if goes_on:
+        _resample(call, -1, k, look_ahead(call, 0, k, particles), particles)
+        return k, particles
     choose_unguided(shares[0], 0.0, local.first, particles.unguided)
-    share = share_at_start(shares[0], local.n_members)
-    start(system, guide, initial_rows(noise), share, particles, local)
-    copies = start_copies(system, noise, members, observer, local)
-    emit_forecast(observer, -1, k, share, particles, nothing, ancestors)
-    predict(system, record, noise, -1, k, copies, observer, nothing, ancestors, local)
-    for j in range(steps.size):
-        while k < steps[j]:
-            until = steps[j] if observer[0] == 0 else k + 1
-            move(system, guide, record, noise, k, until, share, particles, local)
-            k = until
-            emit_forecast(observer, j, k, share, particles, nothing, ancestors)
-            predict(system, record, noise, j, k, copies, observer, nothing, ancestors, local)
-        if is_missing(record.observed, j):
-            to.terms[j] = 0.0
-            continue
-        weigh_moves(particles, share, members.log_w)
-        begin_interval(particles)
-        d = record.observed[j]
-        found = update(system, j, k, record.t0 + k * dt, d, noise, members, local, ())
-        if found.failure != NONE:
-            health[0], health[1], health[2], to.n_effective[j] = 0.0, found.failure, j, 0.0
-            break
-        to.terms[j] = found.increment
-        share = shares[j + 1]
-        log_total, to.n_effective[j] = look_ahead(guide, j, k, share, particles, local)
-        health[0] = min(health[0], to.n_effective[j])
-        emit(observer, UPDATED, j, k, members, d, ancestors)
-        if resampling.always or share > 0.0 or to.n_effective[j] < resampling.threshold:
-            z = resampling_normals(noise, j, k)
-            choose_unguided(share, place_of_unguided(z), local.first, particles.unguided)
-            resample_ahead(guide, j, k, log_total, resampling, z, share, particles, local)
-            emit(observer, RESAMPLED, j, k, members, nothing, ancestors)
-        copy_again(members, copies, observer)
-    if health[1] == NONE:
-        emit(observer, ENDED, steps.size, k, members, nothing, ancestors)
-    return OK
+    share = particles.ahead[0] = share_at_start(shares[0], local.n_members)
+    draw_start(call, guide, share, particles)
+    if call.observer[0] != 0:
+        show_forecast(call, -1, k, particles)
+        start_copies(call, particles)
+    return k, particles
+
+
+@inline_always
+def _advance(call, j, k, last, particles):
+    """Move up to the row, step by step if somebody looks."""
+    if call.observer[0] == 0:
+        move(call, k, last, particles)
+        return
+    for step in range(k, last):
+        move(call, step, step + 1, particles)
+        show_forecast(call, j, step + 1, particles)
+        move_copies(call, j, step + 1, particles)
+
+
+@inline_always
+def _observe(call, j, k, particles):
+    """Divide the weights by what the guide has done, weigh by the observation, and look ahead."""
+    weigh_moves(particles, particles.members.log_w)
+    begin_interval(particles)
+    found = observe(call, j, k, Plain(particles.members))
+    if found.failure != NONE:
+        return failed(found.failure)
+    n_effective = look_ahead(call, j + 1, k, particles)
+    return Outcome(found.increment, n_effective, n_effective, NONE)
+
+
+@inline_always
+def _resample(call, j, k, n_weighted, particles):
+    """Resample by w psi in front of the rows ahead; a state is left without it."""
+    resampling = call.resampling
+    is_few = resampling.always or particles.ahead[0] > 0.0 or n_weighted < resampling.threshold
+    is_few &= j + 1 < call.record.steps.size
+    if is_few:
+        resample_ahead(call, j + 1, k, particles)
+    if call.observer[0] != 0:
+        copy_again(particles)
+    return is_few
 
 
 @dataclass(frozen=True)
@@ -165,6 +157,10 @@ class GuidedPF(ParticleFilter):
     but no better, and slower: use that one where a sensor folds. What 128 unguided particles do not
     find, such as a narrow way under a precise sensor, can still be missed.
 
+    A run that goes on from a state is guided by the rows that it is given, from its particles on.
+    The estimate of a record in parts is unbiased too, with more noise the shorter the parts are;
+    row by row, as in ``sample_smc(data="sequential")``, it looks ahead by one row.
+
     Particles are where the whole record wants them, so that a part of its terms is no estimate of
     those rows: a start of which nothing is known makes the first terms too low and the others too
     high. `compute_log_likelihood` and `leave_future_out` take differences of estimates of shorter
@@ -201,9 +197,10 @@ class GuidedPF(ParticleFilter):
     """
 
     unbiased: ClassVar[bool] = True
-    resumes: ClassVar[bool] = False
     needs_record_ahead: ClassVar[bool] = True
-    entry: ClassVar[EntryPoint] = likelihood_entry("guided_pf", _evaluate, needs=(FILL_NORMALS,))
+    entry: ClassVar[EntryPoint] = member_filter(
+        "guided_pf", _observe, start=_start, advance=_advance, resample=_resample
+    )
     _: KW_ONLY
     resample_below: float = 0.5
 

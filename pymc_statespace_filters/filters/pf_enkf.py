@@ -1,12 +1,12 @@
 """Particle filter with an ensemble Kalman proposal (thesis, section 4.4, Eqs. 4.29-4.44)."""
 
 from dataclasses import KW_ONLY, dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from ..compiler.native.entry_point import EntryPoint
-from ..compiler.native.jit import njit_internal
+from ..compiler.native.jit import inline_always, njit_internal
 from ..errors import ModelError
 from .bootstrap import BootstrapPF
 from .ensemble.base import check_choice
@@ -18,13 +18,14 @@ from .ensemble.kalman_update import (
     kalman_update,
     mark_finite,
 )
-from .ensemble.loop import Outcome, failed
+from .ensemble.loop import Members, Outcome, failed, member_filter, time_of
+from .ensemble.loop import start as start_members
 from .ensemble.noise import observation_normals
-from .ensemble.particle_filter import ParticleFilter, particle_filter
+from .ensemble.particle_filter import ParticleFilter
 from .ensemble.weights import normalise_weights
-from .kernel_density.density import density_method, importance_workspace, reweight
+from .kernel_density.density import Scratch, density_method, importance_workspace, reweight
 from .outcomes import NONE
-from .plan import log_density, observe
+from .plan import log_density, simulate
 from .protocol import System
 
 _ONE_PARTICLE = 1e-10  # 1 - sum w^2 below this: one particle has all the weight, no covariance
@@ -33,20 +34,30 @@ _LIKELIHOODS = ("predictive", "weights")
 _PREDICTIVE = 0
 
 
-@njit_internal
-def workspace(system, local, settings):
-    """The choice of the likelihood, and scratch of an update."""
-    return int(settings[2]), importance_workspace(system, local)
+class Parts(NamedTuple):
+    """The particles, the choice of the likelihood, and scratch of an update."""
+
+    members: Members
+    likelihood: int
+    scratch: Scratch
 
 
 @njit_internal
-def update(system, j, k, t, d, noise, members, local, work):
+def start(call):
+    """Draw the particles or take those of a state; the step, and the parts."""
+    k, (members,) = start_members(call)
+    return k, Parts(members, int(call.settings[0]), importance_workspace(call.system, call.local))
+
+
+@inline_always
+def observe(call, j, k, parts):
     """Move the particles by a Kalman gain, and weight them for the densities that this changes."""
+    system, local, t, d = call.system, call.local, time_of(call, k), call.record.observed[j]
+    members, likelihood, scratch = parts
     X, log_w, alive = members.X, members.log_w, members.alive
-    likelihood, scratch = work
 
     # Simulated observations (Eq. 4.29), and previous weights of the particles that are alive
-    observe(system, k, t, observation_normals(noise, j, k), noise.sizes.width, X, members.D)
+    simulate(system, k, t, observation_normals(call.noise, j, k), local.width, X, members.D)
     mark_finite(X, members.D, alive)
     for i in range(log_w.size):
         log_w[i] = log_w[i] if alive[i] else -np.inf
@@ -153,7 +164,7 @@ class PFEnKF(ParticleFilter):
     likelihood: str = "predictive"
 
     simulates: ClassVar[bool] = True
-    entry: ClassVar[EntryPoint] = particle_filter("pf_enkf", workspace, update, n_settings=1)
+    entry: ClassVar[EntryPoint] = member_filter("pf_enkf", observe, start=start)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -200,9 +211,9 @@ class PFEnKF(ParticleFilter):
                 "draws, got discrete distributions"
             )
 
-    def settings(self) -> tuple[float, ...]:
-        """Return the settings of the resampling and the number of the likelihood."""
-        return (*super().settings(), _LIKELIHOODS.index(self.likelihood))
+    def settings(self, system: System) -> tuple[float, ...]:
+        """Return the number of the likelihood."""
+        return (_LIKELIHOODS.index(self.likelihood),)
 
     def algorithm(self, system: System) -> ParticleFilter:
         """Return the bootstrap filter where no Kalman gain exists or it would move nothing."""

@@ -243,7 +243,7 @@ def propagate(system, k, t, z, width, X):
 
 
 @njit_internal
-def observe(system, k, t, z, width, X, D):
+def simulate(system, k, t, z, width, X, D):
     """Simulate an observation of every member (Eq. 4.15)."""
     call_members(system.observe, system, k, t, z, width, X, D)
 

@@ -169,14 +169,12 @@ class ToleranceFilter(Filter, Protocol):
 class Properties(NamedTuple):
     """What a filter is beyond its methods: its attributes of these names, False if it has none.
 
-    It ``resumes`` if it has a plan and can go on from its state after earlier rows, and
-    ``resumes_many`` if its `BatchFilter.plan_of_many` does so at many points; its particles
+    It ``resumes_many`` if its `BatchFilter.plan_of_many` goes on at many points; its particles
     move by the rows to come if it ``needs_record_ahead``; and the mean of its estimates is the
     likelihood, for any number of members, if it is ``unbiased``. One that ``finds_path`` compiles
     "most probable" states, too.
     """
 
-    resumes: bool
     resumes_many: bool
     needs_record_ahead: bool
     unbiased: bool

@@ -6,54 +6,45 @@ front of an observation, which tries all that may happen. See `regimes.particles
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from ..compiler.lowering.compiled_system import compile_system
 from ..compiler.native.entry_point import EntryPoint
-from ..compiler.native.jit import copy_into, njit_internal
-from ..compiler.native.plan import NORMALS, STATE, Plan
-from ..compiler.native.planned_function import PlannedFunction
-from ..compiler.numerics.normals import FILL_NORMALS, padded
-from .calls import OK, likelihood_entry, state_given
+from ..compiler.native.jit import copy_into, keep_alive, njit_internal
+from ..compiler.native.plan import Plan
+from ..compiler.numerics.normals import padded
 from .ekf import EKF
 from .ensemble.backward_simulation import STORE
-from .ensemble.callbacks import FORECAST, RESAMPLED, UPDATED, emit
+from .ensemble.callbacks import FORECAST
 from .ensemble.failures import failure_of_all
 from .ensemble.kalman_update import mark_finite
 from .ensemble.loop import (
-    N_LEADING,
     Members,
-    begin,
-    finish,
-    new_members,
-    noise_of_rank,
-    observer_of,
-    rank_of,
+    Outcome,
+    advance,
+    failed,
+    member_filter,
+    members_with,
+    show,
+    start,
+    time_of,
 )
-from .ensemble.noise import NoiseSizes, process_normals, resampling_normals
+from .ensemble.noise import NoiseSizes, process_normals
 from .ensemble.particle_filter import ParticleFilter
-from .ensemble.reductions import local_partition
-from .ensemble.resampling import check_sortable, resample_if_few, resampler, smooth_resampling
-from .ensemble.summaries import LAST_EVENTS
+from .ensemble.resampling import check_sortable, smooth_resampling
 from .ensemble.weights import normalise_weights
 from .iplf import IPLF
 from .outcomes import NONE, is_missing
-from .plan import NULL, PLAN, call_members, make_plan, propagate, read_system, settings_of
+from .plan import NULL, PLAN, call_members, propagate
 from .protocol import System
 from .regimes.checks import check_hybrid, check_inner
 from .regimes.hybrid import hybrid_of
 from .regimes.moves import moves_of_parts
-from .regimes.particle_states import (
-    RUN_OF_MIXTURE,
-    SMOOTH_MIXTURE,
-    STATES_OF_MIXTURE,
-    SUMMARISE_MIXTURE,
-)
+from .regimes.particle_states import SMOOTH_MIXTURE
 from .regimes.particles import HybridParticles, hybrid_particles
-from .signatures import RUN, STATES
-from .state_law import StateLaw, weighted_columns
+from .state_law import Layout
 from .ukf import UKF
 
 
@@ -70,84 +61,63 @@ def _seen_at(system, d, k, t):
 
 
 @njit_internal
-def _weigh(members, log_density, local):
-    """Add the log-densities of an observation to the weights; their sum and effective number."""
+def _show_forecast(call, j, k, members):
+    """Show copies of the particles that move without the observation at the end of the step."""
+    copies = members_with(members, members.X.copy(), members.log_w)
+    z = process_normals(call.noise, k)
+    propagate(call.system, k, time_of(call, k), z, call.local.width, copies.X)
+    show(call, FORECAST, j, k + 1, copies, call.nothing)
+
+
+class Parts(NamedTuple):
+    """The particles, and whether they have moved to a row with its observation, (1,)."""
+
+    members: Members
+    has_moved: np.ndarray
+
+
+@njit_internal
+def _start(call):
+    k, (members,) = start(call)
+    return k, Parts(members, np.zeros(1, np.bool_))
+
+
+@njit_internal
+def _advance(call, j, k, last, parts):
+    """Move up to the row, by the last step given its observation."""
+    record, members = call.record, parts.members
+    if is_missing(record.observed, j):
+        advance(call, j, k, last, parts)
+        return
+    advance(call, j, k, last - 1, parts)
+    k = last - 1
+    if call.observer[0] != 0:
+        _show_forecast(call, j, k, members)
+    seen = _seen_at(call.system, record.observed[j], k + 1, time_of(call, k + 1))
+    z, width, gains = process_normals(call.noise, k), call.local.width, np.int64(seen.ctypes.data)
+    move = call.plan[PLAN.move_to_observation]
+    call_members(move, call.system, k, time_of(call, k), z, width, members.X, gains)
+    keep_alive(seen)
+    parts.has_moved[0] = True
+
+
+@njit_internal
+def _observe(call, j, k, parts):
+    """Add the log-densities of the observation, which are behind the particles, to the weights."""
+    members, t, d = parts.members, time_of(call, k), call.record.observed[j]
+    if not parts.has_moved[0]:
+        condition = call.plan[PLAN.condition]
+        call_members(condition, call.system, k, t, d, NULL, members.X, NULL)
+    parts.has_moved[0] = False
     mark_finite(members.X, members.X, members.alive)
     log_w = members.log_w
     for i in range(log_w.size):
         members.alive[i] &= log_w[i] > -np.inf
-        log_w[i] = log_w[i] + log_density[i] if members.alive[i] else -np.inf
-    return normalise_weights(log_w, members.w, local)
-
-
-@njit_internal
-def _show_forecast(observer, system, j, k, t, noise, local, members, nothing, ancestors):
-    """Show copies of the particles that move without the observation at the end of the step."""
-    if observer[0] == 0:
-        return
-    copies = Members(
-        X=members.X.copy(), D=members.D, X_f=members.X_f, w=members.w, log_w=members.log_w,
-        log_p=members.log_p, alive=members.alive,
-    )  # fmt: skip
-    propagate(system, k, t, process_normals(noise, k), local.width, copies.X)
-    emit(observer, FORECAST, j, k + 1, copies, nothing, ancestors)
-
-
-@njit_internal
-def _evaluate(plan, record, request, seed, to):
-    given, steps, t0 = settings_of(plan), record.steps, record.t0
-    system = read_system(plan, record.theta, record.inputs)
-    local = local_partition(rank_of(request), int(given[0]), 8)
-    noise, fits = noise_of_rank(seed, request, given, steps, local)
-    if not fits:
-        return NORMALS
-    resampling = resampler(
-        given[N_LEADING], int(given[N_LEADING + 1]), plan[PLAN.order], system.n, local
-    )
-    rows = np.empty((system.n + 1, local.size))
-    members, log_density = new_members(rows[: system.n], system.p, local), rows[system.n]
-    observer, health, dt, width = observer_of(request), to.health, system.dt, local.width
-    health[0], health[1], health[2] = given[0], NONE, -1
-    if system.failure != NONE:
-        health[0], health[1], health[2] = 0.0, system.failure, 0.0
-    nothing, ancestors = np.empty(0), resampling.ancestors
-    k = begin(plan, system, state_given(request), noise, width, members, observer, ancestors)
-    if k < 0:
-        return STATE
-    for j in range(steps.size if health[1] == NONE else 0):
-        d, missing = record.observed[j], is_missing(record.observed, j)
-        while k < (steps[j] if missing else steps[j] - 1):
-            propagate(system, k, t0 + k * dt, process_normals(noise, k), width, members.X)
-            k += 1
-            emit(observer, FORECAST, j, k, members, nothing, ancestors)
-        if missing:
-            to.terms[j] = 0.0
-            continue
-        if k < steps[j]:
-            t = t0 + k * dt
-            _show_forecast(observer, system, j, k, t, noise, local, members, nothing, ancestors)
-            seen = _seen_at(system, d, k + 1, t0 + (k + 1) * dt)
-            z = process_normals(noise, k)
-            address = np.int64(seen.ctypes.data)
-            call_members(plan[PLAN.move_to_observation], system, k, t, z, width, members.X, address)
-            k += 1
-        else:
-            call_members(plan[PLAN.condition], system, k, t0 + k * dt, d, NULL, members.X, NULL)
-        increment, n_effective = _weigh(members, log_density, local)
-        to.n_effective[j] = n_effective
-        health[0] = min(health[0], n_effective)
-        if increment == -np.inf:
-            health[1] = failure_of_all(system, k, t0 + k * dt, d, members, local)
-            health[0], health[2], to.n_effective[j] = 0.0, j, 0.0
-            break
-        to.terms[j] = increment
-        emit(observer, UPDATED, j, k, members, d, ancestors)
-        z = resampling_normals(noise, j, k)
-        log_w, w = members.log_w, members.w
-        if resample_if_few(resampling, n_effective, z, log_w, w, members.X, local):
-            emit(observer, RESAMPLED, j, k, members, nothing, ancestors)
-    finish(steps.size, k, members, observer, ancestors, to)
-    return OK
+        log_w[i] = log_w[i] + members.behind[i] if members.alive[i] else -np.inf
+    increment, n_effective = normalise_weights(log_w, members.w, call.local)
+    if increment == -np.inf:
+        return failed(failure_of_all(call.system, k, t, d, members, call.local))
+    return Outcome(increment, n_effective, n_effective, NONE)
 
 
 @dataclass(frozen=True)
@@ -214,7 +184,7 @@ class RBPF(ParticleFilter):
     (20, 3)
     """
 
-    entry: ClassVar[EntryPoint] = likelihood_entry("rbpf", _evaluate, needs=(FILL_NORMALS,))
+    entry: ClassVar[EntryPoint] = member_filter("rbpf", _observe, start=_start, advance=_advance)
     _: KW_ONLY
     resample_below: float = 0.5
     inner: EKF | UKF | IPLF = field(default=EKF())
@@ -249,25 +219,19 @@ class RBPF(ParticleFilter):
         """Return the names of the functions of the particles that the entry calls."""
         return "initialise", "propagate", "log_density"
 
-    def compile_states(self, system: System, moment: str) -> PlannedFunction:
-        """Compile "predicted", "filtered" or "smoothed" states."""
-        if moment == "smoothed":
-            return PlannedFunction(self.smoother(system), *STATES)
-        return PlannedFunction(self._observed(system, STATES_OF_MIXTURE, moment), *STATES)
+    def system_of_parts(self, system: System) -> System:
+        """Return the system of the particles."""
+        return self._particles(system).system
 
-    def compile_run(self, system: System) -> PlannedFunction:
-        """Compile one run with all that it computes."""
-        return PlannedFunction(self._observed(system, RUN_OF_MIXTURE, "filtered"), *RUN)
-
-    def _observed(self, system: System, run: EntryPoint, moment: str) -> Plan:
-        last_event = LAST_EVENTS[moment]
-        return self.observed(system, run, observer=SUMMARISE_MIXTURE, last_event=last_event)
-
-    def law_of_state(self, system: System, states: np.ndarray) -> StateLaw:
-        """Return the law of the state, from what the filter leaves (m, S) at m points."""
+    def layout(self, system: System) -> Layout:
+        """Return what a particle holds: regimes, then mean and covariance of the other states."""
         particles = self._particles(system)
-        n_finite, order = particles.hybrid.regimes.shape[1], particles.hybrid.order
-        return weighted_columns(states, particles.system.n, n_finite, order)
+        hybrid = particles.hybrid
+        return Layout(particles.system.n, hybrid.regimes.shape[1], hybrid.order)
+
+    def settings(self, system: System) -> tuple[float, ...]:
+        """Return how many draws of the finite variables a step has."""
+        return (len(self._particles(system).hybrid.drawn),)
 
     def smoother(self, system: System) -> Plan:
         """Plan backward simulation."""
@@ -282,21 +246,10 @@ class RBPF(ParticleFilter):
         self, system: System, run: EntryPoint, functions: Sequence[str], **others: int | EntryPoint
     ) -> Plan:
         """Return the plan of a function that reads the settings of this filter."""
-        particles, size = self._particles(system), self.size()
-        hybrid, order = particles.hybrid, self.ordering()
         if functions:
-            names = ("condition", "move_to_observation")
+            particles, names = self._particles(system), ("condition", "move_to_observation")
             others |= {name: getattr(particles, name).entry for name in names}
-        if order is not None:
-            others["order"] = order
-        settings = (
-            size, *self.noise_sizes(system), *self.settings(), hybrid.regimes.shape[1],
-            len(hybrid.drawn), *hybrid.order,
-        )  # fmt: skip
-        return make_plan(
-            particles.system, run, functions, settings, n_members=size,
-            state_size=1 + (particles.system.n + 1) * size, **others,
-        )  # fmt: skip
+        return super().plan(system, run, functions, **others)
 
     def _particles(self, system: System) -> HybridParticles:
         return hybrid_particles(system.written, self.inner.linearization)

@@ -13,6 +13,23 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
+class Layout(NamedTuple):
+    """What the columns of a filter's parts hold: ``rows`` numbers, of which some are exact states.
+
+    The others are the means and the lower triangle of the covariance of the other states.
+    ``order`` (n,) tells where each state of the system is among these.
+    """
+
+    rows: int
+    n_exact: int
+    order: NDArray[np.int64]
+
+
+def exact_states(n: int) -> Layout:
+    """The layout of members that are states."""
+    return Layout(n, n, np.arange(n))
+
+
 class StateLaw(NamedTuple):
     """Mixtures of K parts at m points.
 
@@ -69,16 +86,12 @@ def _normal(triangles: Array, n: int, rng: np.random.Generator) -> Array:
     return np.asarray((vectors @ z[:, :, np.newaxis])[:, :, 0])
 
 
-def weighted_columns(states: Array, rows: int, n_exact: int, order: NDArray[np.int64]) -> StateLaw:
+def law_of_parts(states: Array, layout: Layout) -> StateLaw:
     """Of columns and their log weights behind them, from vectors (m, 1 + (rows + 1) * K)."""
+    rows, n_exact, order = layout
     m, size = len(states), (states.shape[1] - 1) // (rows + 1)
     parts = states[:, 1 : 1 + rows * size].reshape(m, rows, size)
     return StateLaw(states[:, 1 + rows * size :], parts, n_exact, order)
-
-
-def law_of_members(states: Array, n: int) -> StateLaw:
-    """Of weighted members, from vectors (m, 1 + (n + 1) * N)."""
-    return weighted_columns(states, n, n, np.arange(n))
 
 
 def law_of_moments(states: Array, n: int) -> StateLaw:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pytensor.graph.traversal import ancestors
 
 from ..errors import ModelError
-from ..filters.protocol import Filter, properties
+from ..filters.protocol import Filter, ResumableFilter
 from ..pymc_model.filter_rows import FilterRows, ParametersAtPoints, Record
 from ..pymc_model.inspection import resized
 from ..pymc_model.prior import ModelPrior
@@ -205,13 +205,9 @@ def _only_variable(model: pm.Model) -> StateSpaceVariable:
 
 def _check_filter(variable: StateSpaceVariable) -> None:
     filter: Any = variable.filter
-    of_filter = properties(filter)
-    if not of_filter.resumes:
-        why = "its state does not hold for rows to come"
-        if of_filter.needs_record_ahead:
-            why = "its guide needs the record ahead"
+    if not isinstance(filter, ResumableFilter):
         name = type(filter).__name__
-        _refuse(f"a filter that goes on row by row, which {name} cannot: {why}")
+        _refuse(f"a filter that goes on row by row, which {name} cannot: it has no state")
     if filter.noisy and variable.score_from:
         _refuse(
             f"score_from=0 with a noisy filter, got {variable.score_from}: the estimate of the "

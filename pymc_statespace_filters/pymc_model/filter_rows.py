@@ -93,9 +93,33 @@ class FilterRows:
     ) -> tuple[Array, Array]:
         """Terms (m, J) of the rows of a record, and the states behind them.
 
-        ``states`` (m, S) are those before the rows; of no columns where the rows are the first.
+        ``states`` (m, S) are those before the rows; of no columns where the rows are the first. A
+        filter that looks ahead sees one row at a time: with all of them at once, its estimates
+        would be of another distribution than those of a run that goes on row by row.
         """
-        return self._evaluate(theta, seeds, states, record)
+        looks_ahead = properties(self.filter).needs_record_ahead
+        evaluate = self._row_by_row if looks_ahead else self._evaluate
+        terms, after = evaluate(theta, seeds, states, record)
+        if np.isnan(after[:, -1]).all():  # states need not have the length that there is room for
+            after = after[:, ~np.isnan(after).all(axis=0)]
+        return terms, after
+
+    def _row_by_row(
+        self, theta: Array, seeds: NDArray[np.int64], states: Array, record: Record
+    ) -> tuple[Array, Array]:
+        terms, alive = np.full((len(theta), len(record.steps)), -np.inf), np.arange(len(theta))
+        for row in range(len(record.steps)):
+            found, left = self._evaluate(
+                theta[alive], seeds[alive], states, record.rows(row, row + 1)
+            )
+            known = np.isfinite(found[:, 0])
+            terms[alive, row] = found[:, 0]
+            alive, states = alive[known], left[known]
+            if not alive.size:
+                break
+        after = np.full((len(theta), states.shape[1]), np.nan)
+        after[alive] = states
+        return terms, after
 
     def law_of_state(self, states: Array) -> StateLaw:
         """The law of the system's state at the points, from what the filter has left."""

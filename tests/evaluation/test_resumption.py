@@ -1,5 +1,8 @@
 """A run that goes on with more rows gives the bits of one run over all of them."""
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -27,6 +30,7 @@ PANEL_STEPS = np.array([0, 2, 3, 7, 1, 4, 6])
 FILTERS = [
     psf.EKF(),
     psf.UKF(),
+    psf.IPLF(),
     psf.EnKF(40),
     psf.BootstrapPF(50),
     psf.BootstrapPF(50, resampling="sorted"),
@@ -92,6 +96,44 @@ def test_every_record_of_a_panel_goes_on():
             np.testing.assert_array_equal(joined, whole[name].values[whole[record].values == label])
 
 
+@pytest.mark.parametrize("filter", [psf.GuidedPF(40), psf.GuidedPF(40, resample_below=1.0)])
+def test_a_guided_filter_in_the_same_parts_has_the_same_bits(filter, tmp_path):
+    """Whatever of its states is shown, and through a file; its own state is among the bits."""
+    for cut in (1, 3, 5):  # behind a missing row, too
+        first = run(filter, slice(cut), at="observations")
+        first.to_netcdf(tmp_path / f"{cut}.nc")
+        with xr.open_dataset(tmp_path / f"{cut}.nc") as stored:
+            state = stored.load()
+        second = run(filter, slice(cut, None), at="observations", state=state)
+        again = run(filter, slice(cut, None), state=run(filter, slice(cut)))
+        np.testing.assert_array_equal(second["filter_state"], again["filter_state"])
+        np.testing.assert_array_equal(second["log_likelihood"], again["log_likelihood"])
+        np.testing.assert_array_equal(second["mean"][-1], again["mean"][-1])
+
+
+@dataclass(frozen=True)
+class Stateless:
+    """A filter of a user that goes on from no state."""
+
+    noisy: ClassVar[bool] = False
+    has_gradient: ClassVar[bool] = False
+
+    def check(self, system):
+        pass
+
+    def is_exact_for(self, system):
+        return False
+
+    def compile(self, system):
+        return psf.EKF().compile(system)
+
+    def compile_states(self, system, moment):
+        return psf.EKF().compile_states(system, moment)
+
+    def smoothing_method(self, system):
+        return "none"
+
+
 def other_system():
     return psf.StateSpaceModel(
         transition=lambda x, q, a: [a * x[0] + q[0], x[1]],
@@ -105,7 +147,8 @@ def other_system():
 
 REFUSED = [
     (psf.EnKF(50), {}, r"got one with filter BootstrapPF"),
-    (psf.GuidedPF(20), {}, r"^GuidedPF cannot go on from an earlier run: its guide needs the"),
+    (psf.GuidedPF(50), {}, r"got one with filter BootstrapPF"),
+    (Stateless(), {}, r"^Stateless cannot go on from an earlier run: it has no state that holds"),
     (psf.BootstrapPF(50, resample_below=0.5), {}, r"got one with filter BootstrapPF\(n_particles="),
     (PF, {"seed": 4}, r"got one with seed 3 instead of 4$"),
     (PF, {"t0": 1.0}, r"got one with t0 0.0 instead of 1.0$"),

@@ -5,16 +5,20 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.filters.state_law import law_of_members
+from pymc_statespace_filters.filters.state_law import exact_states, law_of_parts
 from tests.filters.test_truth_regimes import INPUTS, OBSERVED, PARAMS, STEPS, SYSTEM
-from tests.systems import PAIR, PAIR_DATA
+from tests.systems import FREE, PAIR, PAIR_DATA
 from tests.systems import STEPS as PAIR_STEPS
 
 M, N = 5000, 400
 PAIRED = PAIR, {"a": 0.5, "b": 0.2}, PAIR_DATA, {"steps": PAIR_STEPS}
 SWITCHING = SYSTEM, PARAMS, OBSERVED, {"steps": STEPS, "inputs": INPUTS}
+ONE = FREE, {"a": 0.9}, [0.3, 1.2], {"steps": [0, 3]}
 CASES = [
     (psf.EKF(), PAIRED),
+    (psf.GridFilter(), ONE),
+    (psf.GridFilter(), (FREE, {"a": -0.2}, [0.9, 1.2, 0.1], {"steps": [0, 3, 5]})),
+    (psf.GuidedPF(N, resample_below=0.0), PAIRED),
     (psf.BootstrapPF(N, resample_below=0.0), PAIRED),
     (psf.EnKF(N), PAIRED),
     (psf.IMM(), SWITCHING),
@@ -39,6 +43,6 @@ def test_draws_have_the_moments_of_the_filter(filter, record):
 
 def test_a_member_that_is_not_finite_is_not_drawn():
     states = np.array([[3.0, 1.0, np.nan, 0.0, 0.0], [3.0, np.nan, np.nan, 0.0, 0.0]])
-    one, none = law_of_members(states, 1).drawn(np.random.default_rng(1)).ravel()
+    one, none = law_of_parts(states, exact_states(1)).drawn(np.random.default_rng(1)).ravel()
     assert one == 1.0
     assert np.isnan(none)

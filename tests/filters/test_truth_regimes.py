@@ -17,10 +17,10 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.lowering.symbols import symbols_of
 from pymc_statespace_filters.errors import FilterWarning, ModelError
+from pymc_statespace_filters.filters.ensemble.part_moments import _row_of_cov, draw_of_mixture
 from pymc_statespace_filters.filters.regimes import backward_simulation
 from pymc_statespace_filters.filters.regimes.draws import draws_of
 from pymc_statespace_filters.filters.regimes.hybrid import hybrid_of
-from pymc_statespace_filters.filters.regimes.moments import _row_of_cov, draw_of_mixture
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.distributed import DistributedLogLikelihood
 from pymc_statespace_filters.ops.likelihood import LogLikelihoodOfNoise, StoredNoise

@@ -8,6 +8,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.written import filter_from, short_form
 from pymc_statespace_filters.pymc_model.other_filter import model_with
+from tests.evaluation.test_resumption import Stateless
 from tests.modes import AS_IT_STANDS
 from tests.parameter_particles.autoregression import DATA, STEPS, exact, model
 
@@ -120,13 +121,11 @@ def test_the_other_parts_of_a_model_stay():
 def test_what_is_no_filter_for_the_model_is_refused():
     with pytest.raises(ModelError, match=r"inner must be a filter, such as .*, got 3"):
         psf.sample_smc(model=model(psf.EKF(), 3), inner=3)
-    with pytest.raises(ModelError, match="GuidedPF cannot: its guide needs the record ahead"):
-        psf.sample_smc(model=model(psf.EKF(), 3), inner=psf.GuidedPF(9), data="sequential")
     with pytest.raises(ModelError, match=r"screen must be .* without noise, .* got EnKF"):
         psf.sample_smc(model=model(psf.EKF(), 3), screen=psf.EnKF(20))
     settings = SMALL | {"data": "sequential"}
-    with pytest.raises(ModelError, match="GridFilter cannot: its state does not hold"):
-        psf.sample_smc(model=model(psf.EKF(), 3), screen=psf.GridFilter(), **settings)
+    with pytest.raises(ModelError, match="Stateless cannot: it has no state"):
+        psf.sample_smc(model=model(psf.EKF(), 3), screen=Stateless(), **settings)
     with pm.Model() as other:
         pm.Normal("a")
     with pytest.raises(ModelError, match="inner must be None for a model without"):

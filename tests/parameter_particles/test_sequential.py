@@ -16,20 +16,19 @@ from pymc_statespace_filters.pymc_model.density import ModelDensity
 from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
 from pymc_statespace_filters.smc.merging import merged_log_evidence
 from pymc_statespace_filters.smc.particles import Populations
+from tests.evaluation.test_resumption import Stateless
 from tests.interrupts import interrupt
 from tests.parameter_particles.autoregression import DATA, STEPS, exact, exact_transforms, model
 from tests.systems import FORCED, FREE, counts, pair
 
+FILTERS = [psf.EKF(), psf.BootstrapPF(6), psf.GuidedPF(6), psf.GridFilter()]
 SETTINGS = {"data": "sequential", "random_seed": 2, "progressbar": False}
 
 
 @pytest.fixture(scope="module")
 def by_filter():
     """Runs over all rows: the noisier filter has its members doubled on the way."""
-    return {
-        filter: psf.sample_smc(150, model=model(filter), **SETTINGS)
-        for filter in (psf.EKF(), psf.BootstrapPF(6))
-    }
+    return {filter: psf.sample_smc(150, model=model(filter), **SETTINGS) for filter in FILTERS}
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +40,7 @@ def run_of_rows():
     return {9: first, 12: psf.extend(first, short, **more)}
 
 
-@pytest.mark.parametrize("filter", [psf.EKF(), psf.BootstrapPF(6)])
+@pytest.mark.parametrize("filter", FILTERS)
 def test_evidences_scores_and_posterior_are_exact(by_filter, filter):
     """At each of 24 rows within 4.5 errors, of 10 populations, of quadrature."""
     found, truth = by_filter[filter], exact()
@@ -80,7 +79,7 @@ def test_an_interrupt_keeps_the_rows_seen(run_of_rows, monkeypatch, caplog):
             assert tree[group].to_dataset().equals(expected[group].to_dataset())
 
 
-@pytest.mark.parametrize("filter", [psf.EKF(), psf.BootstrapPF(6)])
+@pytest.mark.parametrize("filter", FILTERS)
 def test_transforms_are_exact(by_filter, filter):
     """A rank among 1000 draws has a deviation of .014 in the root mean square of all rows.
 
@@ -197,7 +196,7 @@ def test_a_model_of_the_same_or_of_other_values(run_of_rows):
         psf.filtered_states(run_of_rows[9], other, random_seed=1)
 
 
-@pytest.mark.parametrize("filter", [psf.EKF(), psf.BootstrapPF(6)])
+@pytest.mark.parametrize("filter", FILTERS)
 def test_a_run_that_is_extended_is_one_run(by_filter, filter, tmp_path):
     first = psf.sample_smc(150, model=model(filter, 9), **SETTINGS)
     first.to_netcdf(tmp_path / "run.nc")
@@ -340,8 +339,7 @@ def test_data_that_do_not_come_row_by_row_are_refused():
         with pytest.raises(ModelError, match=rf"data='sequential' needs .*{match}"):
             psf.sample_smc(20, model=build, **SETTINGS)
 
-    refused("GuidedPF cannot: its guide needs the record ahead", model(psf.GuidedPF(20)))
-    refused("GridFilter cannot", model(psf.GridFilter()))
+    refused("Stateless cannot: it has no state", model(Stateless()))
     refused("score_from=0", model(psf.BootstrapPF(20), score_from=2))
     with model(psf.EKF()) as two:
         psf.StateSpace("e", FREE, psf.EKF(), steps=STEPS, observed=DATA)

@@ -28,7 +28,8 @@ from ..calls import ALL_STEPS, OK, opened, single_record, wanted_rows
 from ..outcomes import NO_PROCESS_NOISE, NONE
 from ..plan import PLAN, propagate, read_system
 from .callbacks import CALLBACK_ARGUMENTS, FORECAST, UPDATED, run_observed
-from .summaries import choose, finite_weights, write_summaries
+from .part_moments import choose
+from .summaries import finite_weights, write_summaries
 from .weights import normalise
 
 PARTICLES_PER_PATH = 16

@@ -18,9 +18,9 @@ from ...system.checks import is_integer
 from ..plan import make_plan
 from ..protocol import System, check_sensor_has_noise
 from ..signatures import LIKELIHOOD_OF_NOISE, NORMALS, RUN, STATES, TERM_HEALTH
-from ..state_law import StateLaw, law_of_members
+from ..state_law import Layout, StateLaw, exact_states, law_of_parts
 from .noise import STORE_NORMALS, NoiseSizes, n_stored
-from .summaries import LAST_EVENTS, MEMBER_RUN, MEMBER_STATES, STORE_MEMBERS, SUMMARISE
+from .summaries import LAST_EVENTS, STATES_OF_PARTS, SUMMARISE
 
 MOST_MEMBERS = 10**8
 
@@ -51,8 +51,8 @@ def check_choice(name: str, value: object, allowed: Iterable[str]) -> None:
 class EnsembleFilterBase:
     """A filter whose likelihood is an estimate made with noise; an `EnsembleFilter`.
 
-    A subclass is a frozen dataclass of settings. It gives its ``entry`` (see
-    `loop.ensemble_filter`), `size` and `settings`, which the entry reads, and how it smooths.
+    A subclass is a frozen dataclass of settings. It gives its ``entry`` (see `loop.member_filter`),
+    `size` and `settings`, which the entry reads, and how it smooths.
 
     Attributes
     ----------
@@ -60,24 +60,25 @@ class EnsembleFilterBase:
         Whether the mean of the estimates is the likelihood, for any number of members.
     simulates : bool
         Whether an update simulates an observation of every member.
-    resumes : bool
-        Whether the filter can go on from its state after earlier rows.
     """
 
     noisy: ClassVar[bool] = True
     unbiased: ClassVar[bool] = False
     has_gradient: ClassVar[bool] = False
     simulates: ClassVar[bool] = False
-    resumes: ClassVar[bool] = True
     entry: ClassVar[EntryPoint]
 
     def size(self) -> int:
         """Return the number of members."""
         raise NotImplementedError
 
-    def settings(self) -> tuple[float, ...]:
-        """Return the settings that the entry reads besides the size, choices by their number."""
-        raise NotImplementedError
+    def settings(self, system: System) -> tuple[float, ...]:
+        """Return the filter's own settings that the entry reads, choices by their number."""
+        return ()
+
+    def when_to_resample(self) -> tuple[float, int]:
+        """Return below which fraction of the members to resample, and the number of the scheme."""
+        return -1.0, 0
 
     def smoother(self, system: System) -> Plan:
         """Return the plan of the smoother of this filter for one system."""
@@ -97,7 +98,15 @@ class EnsembleFilterBase:
 
     def law_of_state(self, system: System, states: np.ndarray) -> StateLaw:
         """Return the law of the state, from what the filter leaves (m, S) at m points."""
-        return law_of_members(states, system.n)
+        return law_of_parts(states, self.layout(system))
+
+    def system_of_parts(self, system: System) -> System:
+        """Return the system whose states the members are, if it is another one."""
+        return system
+
+    def layout(self, system: System) -> Layout:
+        """Return what the columns of the members hold."""
+        return exact_states(system.n)
 
     def algorithm(self, system: System) -> "EnsembleFilterBase":
         """Return the filter that treats this system: itself, unless it reduces to another."""
@@ -156,15 +165,16 @@ class EnsembleFilterBase:
         filter = self.algorithm(system)
         if moment == "smoothed":
             return PlannedFunction(filter.smoother(system), *STATES)
-        last_event = LAST_EVENTS[moment]
-        plan = filter.observed(system, MEMBER_STATES, observer=SUMMARISE, last_event=last_event)
-        return PlannedFunction(plan, *STATES)
+        return PlannedFunction(filter.summarised(system, moment), *STATES)
 
     def compile_run(self, system: System) -> PlannedFunction:
         """Compile one run with all that it computes."""
-        last_event, filter = LAST_EVENTS["filtered"], self.algorithm(system)
-        plan = filter.observed(system, MEMBER_RUN, observer=STORE_MEMBERS, last_event=last_event)
-        return PlannedFunction(plan, *RUN)
+        return PlannedFunction(self.algorithm(system).summarised(system, "filtered"), *RUN)
+
+    def summarised(self, system: System, moment: str) -> Plan:
+        """Return the plan of a run that writes "predicted" or "filtered" states."""
+        last_event = LAST_EVENTS[moment]
+        return self.observed(system, STATES_OF_PARTS, observer=SUMMARISE, last_event=last_event)
 
     def functions(self) -> Sequence[str]:
         """Return the names of the system's functions that the entry calls."""
@@ -194,10 +204,15 @@ class EnsembleFilterBase:
     ) -> Plan:
         """Return the plan of a function that reads the settings of this filter."""
         size, order = self.size(), self.ordering()
-        settings = (size, *self.noise_sizes(system), *self.settings())
+        layout = self.layout(system)
+        settings = (
+            size, *self.noise_sizes(system), *self.when_to_resample(), layout.rows, layout.n_exact,
+            len(layout.order), *layout.order, *self.settings(system),
+        )  # fmt: skip
         if order is not None:
             others = {**others, "order": order}
-        state_size = 1 + (system.n + 1) * size if self.resumes else 0  # see `loop.dump`
+        state_size = 1 + (layout.rows + 1) * size  # a step, members and log weights
         return make_plan(
-            system, run, functions, settings, n_members=size, state_size=state_size, **others
-        )
+            self.system_of_parts(system), run, functions, settings, n_members=size,
+            state_size=state_size, **others,
+        )  # fmt: skip

@@ -5,63 +5,48 @@ There are copies only if a callback is there to see them.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from ...compiler.native.jit import copy_into, njit_internal
 from ..plan import initialise, propagate_guided
-from .callbacks import PREDICTED, emit
-from .guide import leave_unguided
-from .loop import Members
+from .callbacks import PREDICTED
+from .loop import members_with, show, time_of
 from .noise import initial_rows, process_normals
 
 _NUMBER_BYTES = 8
 
 
-class Copies(NamedTuple):
-    """States (n, N) and weights of the copies, and the gains of a step without guidance."""
-
-    members: Members
-    gains: np.ndarray
+@njit_internal
+def _show(call, j, k, particles):
+    n, log_w = call.system.n, particles.copies_log_w
+    copies = members_with(particles.members, particles.copies[:n], log_w)
+    show(call, PREDICTED, j, k, copies, call.nothing)
 
 
 @njit_internal
-def start_copies(system, noise, members, callback, local):
-    """Copies at step 0, drawn without the guide."""
-    n, m = system.n, system.m
-    size = local.size if callback[0] != 0 else 0
-    rows, log_w = np.zeros((n + 1, size)), np.empty(size)  # the last row for density ratios
-    gains = np.zeros(1 + m + m * n + m * (m + 1) // 2)
-    leave_unguided(gains, n, m)
-    copies = Members(
-        X=rows[:n], D=members.D, X_f=members.X_f, w=members.w, log_w=log_w, log_p=members.log_p,
-        alive=members.alive,
-    )  # fmt: skip
-    if size:
-        initialise(system, initial_rows(noise).ctypes.data, local.width, copies.X)
-        for i in range(size):
-            log_w[i] = -math.log(local.n_members)
-    return Copies(copies, gains)
+def start_copies(call, particles):
+    """Draw copies at step 0, without the guide, and show them."""
+    z = initial_rows(call.noise).ctypes.data
+    initialise(call.system, z, call.local.width, particles.copies[: call.system.n])
+    for i in range(particles.copies_log_w.size):
+        particles.copies_log_w[i] = -math.log(call.local.n_members)
+    _show(call, -1, np.int64(0), particles)
 
 
 @njit_internal
-def predict(system, record, noise, j, k, copies, callback, nothing, ancestors, local):
-    """Move the copies to step k, and show them; at step 0 they are there."""
-    if callback[0] == 0:
-        return
-    if k > 0:
-        gains = np.int64(copies.gains.ctypes.data) + _NUMBER_BYTES
-        t, z = record.t0 + (k - 1) * system.dt, process_normals(noise, k - 1)
-        propagate_guided(system, k - 1, t, z, local.width, copies.members.X, gains)
-    emit(callback, PREDICTED, j, k, copies.members, nothing, ancestors)
+def move_copies(call, j, k, particles):
+    """Move the copies to step k, and show them."""
+    gains = np.int64(particles.plain.ctypes.data) + _NUMBER_BYTES
+    t, z = time_of(call, k - 1), process_normals(call.noise, k - 1)
+    X = particles.copies[: call.system.n]
+    propagate_guided(call.system, k - 1, t, z, call.local.width, X, gains)
+    _show(call, j, k, particles)
 
 
 @njit_internal
-def copy_again(members, copies, callback):
+def copy_again(particles):
     """Begin anew from the particles after an update."""
-    if callback[0] == 0:
-        return
-    copy_into(copies.members.log_w, members.log_w)
-    for a in range(members.X.shape[0]):
-        copy_into(copies.members.X[a], members.X[a])
+    copy_into(particles.copies_log_w, particles.members.log_w)
+    for a in range(particles.members.X.shape[0]):
+        copy_into(particles.copies[a], particles.members.X[a])

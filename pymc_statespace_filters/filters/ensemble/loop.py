@@ -1,4 +1,9 @@
-"""The loop of every ensemble filter: predict up to an observation, update, record the increment."""
+"""The loop of every filter with members along a record: start, advance, observe.
+
+Members are columns of X with log weights: states of the system, or whatever else the functions of
+the filter make of a column. Noise of a step is a function of seed, step and member, so that a
+filter that goes on from a state has the bits of one run over all rows.
+"""
 
 import math
 from collections.abc import Callable
@@ -10,16 +15,59 @@ from ...compiler.native.entry_point import EntryPoint
 from ...compiler.native.jit import copy_into, inline_always, njit_internal
 from ...compiler.native.plan import NORMALS, REQUEST, STATE
 from ...compiler.numerics.normals import FILL_NORMALS
-from ..calls import OK, likelihood_entry, reals_at, state_given
+from ..calls import OK, Record, likelihood_entry, reals_at, state_given
 from ..outcomes import NONE, is_missing
-from ..plan import PLAN, initialise, propagate, read_system, settings_of
+from ..plan import PLAN, SystemPointers, initialise, propagate, read_system, settings_of
+from ..state_law import Layout
 from .callbacks import ENDED, FORECAST, RESAMPLED, UPDATED, emit
-from .noise import NoiseSizes, initial_normals, n_stored, noise_of, process_normals, sizes_of
+from .noise import (
+    Noise,
+    NoiseSizes,
+    initial_normals,
+    n_stored,
+    noise_of,
+    process_normals,
+    resampling_normals,
+    sizes_of,
+)
 from .origins import effective_number_of_origins, follow_ancestors, new_origins
-from .reductions import RankLayout, local_partition
+from .reductions import MEMBERS, LocalPartition, RankLayout, allgather, local_partition
+from .resampling import Resampling, resample_if_few, resampler
 
-N_LEADING = 6
-"""Settings of every filter: the number of members and five of `NoiseSizes`."""
+N_LEADING = 8
+"""Settings of every filter: the number of members, five of `NoiseSizes`, and two of resampling:
+below which fraction of the members, and the number of the scheme. The layout follows, see
+`layout_of`, then the filter's own settings."""
+
+
+@njit_internal
+def layout_of(plan):
+    """The layout of the parts of a filter, and the filter's own settings."""
+    given = settings_of(plan)[N_LEADING:]
+    order = np.empty(int(given[2]), np.int64)
+    for a in range(order.size):
+        order[a] = int(given[3 + a])
+    return Layout(int(given[0]), int(given[1]), order), given[3 + order.size :]
+
+
+class Evaluation(NamedTuple):
+    """One evaluation of a filter: all that its functions read.
+
+    ``state`` is what the filter goes on from, empty where it starts. ``settings`` are the filter's
+    own, as numbers. ``local`` says which of all members are here: with MPI other ranks have the
+    others, and `reductions` sums over all. ``nothing`` is an empty vector.
+    """
+
+    plan: np.ndarray
+    system: SystemPointers
+    record: Record
+    state: np.ndarray
+    settings: np.ndarray
+    noise: Noise
+    local: LocalPartition
+    resampling: Resampling
+    observer: tuple
+    nothing: np.ndarray
 
 
 class Members(NamedTuple):
@@ -28,6 +76,7 @@ class Members(NamedTuple):
     ``w`` and ``log_w`` are the normalised weights; ``log_w`` is kept from one observation to the
     next. ``D`` (p, N), ``X_f`` (n, N), ``log_p`` and ``alive`` belong to one update: simulated
     observations, the forecast before the analysis, log p(d | x), and which members are finite.
+    ``behind`` (N,) follows X in memory: a number that a function of members writes for each.
     """
 
     X: np.ndarray
@@ -37,10 +86,11 @@ class Members(NamedTuple):
     log_w: np.ndarray
     log_p: np.ndarray
     alive: np.ndarray
+    behind: np.ndarray
 
 
 class Outcome(NamedTuple):
-    """What an update returns.
+    """What `observe` returns.
 
     ``increment`` is log p(d_j | d_1 .. d_{j-1}), the log of a mean, and ``n_effective`` the
     effective number of the weights of that mean: below a few, one member decides the increment.
@@ -61,15 +111,24 @@ def failed(failure, n_effective=0.0):
 
 
 @njit_internal
-def new_members(X, p, local):
-    """Members of equal weight with the states X."""
+def new_members(n, p, local):
+    """Members of equal weight, without states."""
     N = local.size
-    log_w = np.empty(N)
+    rows, log_w = np.zeros((n + 1, N)), np.empty(N)
     for i in range(N):
         log_w[i] = -math.log(local.n_members)
     return Members(
-        X=X, D=np.empty((p, N)), X_f=np.empty(X.shape), w=np.empty(N), log_w=log_w,
-        log_p=np.empty(N), alive=np.empty(N, np.bool_),
+        X=rows[:n], D=np.empty((p, N)), X_f=np.empty((n, N)), w=np.empty(N), log_w=log_w,
+        log_p=np.empty(N), alive=np.empty(N, np.bool_), behind=rows[n],
+    )  # fmt: skip
+
+
+@inline_always
+def members_with(members, X, log_w):
+    """Other states and weights, to be shown, with the same scratch."""
+    return Members(
+        X=X, D=members.D, X_f=members.X_f, w=members.w, log_w=log_w, log_p=members.log_p,
+        alive=members.alive, behind=members.behind,
     )  # fmt: skip
 
 
@@ -79,24 +138,8 @@ def n_sums(system):
     return 8 + 2 * (system.n + system.p) ** 2
 
 
-@inline_always
-def rank_of(request):
-    """Which of the ranks that evaluate together this one is."""
-    return RankLayout(request[REQUEST.rank], request[REQUEST.n_ranks], request[REQUEST.exchange])
-
-
-@inline_always
-def observer_of(request):
-    """The callback that sees the members, see `callbacks`."""
-    return (
-        request[REQUEST.observer],
-        request[REQUEST.observer_integers],
-        request[REQUEST.observer_reals],
-    )
-
-
 @njit_internal
-def noise_of_rank(seed, request, given, steps, local):
+def _noise_of_rank(seed, request, given, steps, local):
     """The normals of this rank, padded to its own width; and whether stored ones are as many."""
     sizes = sizes_of(given)
     own = NoiseSizes(local.width, sizes[1], sizes[2], sizes[3], sizes[4])
@@ -106,134 +149,174 @@ def noise_of_rank(seed, request, given, steps, local):
     return noise_of(seed, stored, own, n_steps, local.first_block), fits
 
 
-class _NoResampling(NamedTuple):
-    ancestors: np.ndarray
+@inline_always
+def _goes_on(state, size, steps, noise):
+    """Whether this is a state of the filter before the first row; noise is not stored for parts."""
+    fits = state.size == size and noise.stored.size == 0
+    return fits and (steps.size == 0 or state[0] < steps[0])
 
 
 @njit_internal
-def no_resampler(settings, order, n, local):
-    """Workspace of a filter that does not resample."""
-    return _NoResampling(np.empty(0, np.int64))
+def _read_evaluation(plan, record, request, seed):
+    """All that the functions of a filter read, and a status."""
+    given, system = settings_of(plan), read_system(plan, record.theta, record.inputs)
+    (n_rows, _, _), own = layout_of(plan)
+    layout = RankLayout(request[REQUEST.rank], request[REQUEST.n_ranks], request[REQUEST.exchange])
+    local = local_partition(layout, int(given[0]), n_sums(system))
+    noise, fits = _noise_of_rank(seed, request, given, record.steps, local)
+    state, status = state_given(request), OK
+    if not fits:
+        status = np.int64(NORMALS)
+    elif state.size and not _goes_on(state, plan[PLAN.state_size], record.steps, noise):
+        status = np.int64(STATE)
+    call = Evaluation(
+        plan=plan, system=system, record=record, state=state, settings=own,
+        noise=noise, local=local,
+        resampling=resampler(given[6], int(given[7]), plan[PLAN.order], n_rows, local),
+        observer=(
+            request[REQUEST.observer], request[REQUEST.observer_integers],
+            request[REQUEST.observer_reals],
+        ),
+        nothing=np.empty(0),
+    )  # fmt: skip
+    return call, status
+
+
+@inline_always
+def time_of(call, k):
+    """The time of step k."""
+    return call.record.t0 + k * call.system.dt
+
+
+@inline_always
+def show(call, event, j, k, members, d):
+    """Call the callback of a run, if there is one."""
+    emit(call.observer, event, j, k, members, d, call.resampling.ancestors)
 
 
 @njit_internal
-def no_resampling(resampler, noise, j, k, n_weighted, members, local):
-    """Keep all members."""
-    return False
+def _rows_of_state(state, n, local):
+    """The members of all ranks in a state, (n + 1, N), the last row their log weights."""
+    return state[1:].reshape(n + 1, local.n_members)
 
 
 @njit_internal
-def _dump(k, members, state):
-    """Write the step, the members and their log weights to a vector."""
-    n, N = members.X.shape
-    state[0] = k
+def restore(call, members):
+    """Take the members from the state that the filter goes on from; its step."""
+    local, (n, _) = call.local, members.X.shape
+    rows, end = _rows_of_state(call.state, n, local), local.first + local.size
     for a in range(n):
-        copy_into(state[1 + a * N : 1 + (a + 1) * N], members.X[a])
-    copy_into(state[1 + n * N :], members.log_w)
+        copy_into(members.X[a], rows[a, local.first : end])
+    copy_into(members.log_w, rows[n, local.first : end])
+    return np.int64(call.state[0])
 
 
 @njit_internal
-def _restore(state, members):
-    """Read what `_dump` wrote; returns the step."""
-    n, N = members.X.shape
+def _leave(k, members, local, state):
+    """Write the state of the filter: the step, the members and their log weights."""
+    n, _ = members.X.shape
+    rows, end, state[0] = _rows_of_state(state, n, local), local.first + local.size, k
     for a in range(n):
-        copy_into(members.X[a], state[1 + a * N : 1 + (a + 1) * N])
-    copy_into(members.log_w, state[1 + n * N :])
-    return np.int64(state[0])
+        copy_into(rows[a, local.first : end], members.X[a])
+    copy_into(rows[n, local.first : end], members.log_w)
+    allgather(local.layout, rows, MEMBERS)
+
+
+class Plain(NamedTuple):
+    """The parts of a filter that has nothing but members."""
+
+    members: Members
 
 
 @njit_internal
-def begin(plan, system, given, noise, width, members, observer, ancestors):
-    """Draw the members at step 0, or take those of a state; the step, or -1 of another state."""
-    if given.size == 0:
-        initialise(system, initial_normals(noise), width, members.X)
-        emit(observer, FORECAST, -1, np.int64(0), members, np.empty(0), ancestors)
-        return np.int64(0)
-    if given.size == plan[PLAN.state_size] and noise.stored.size == 0:
-        return _restore(given, members)
-    return np.int64(-1)
+def start(call):
+    """Draw the members at step 0, or take those of a state; the step, and the parts."""
+    members = new_members(call.system.n, call.system.p, call.local)
+    if call.state.size:
+        return restore(call, members), Plain(members)
+    initialise(call.system, initial_normals(call.noise), call.local.width, members.X)
+    show(call, FORECAST, -1, np.int64(0), members, call.nothing)
+    return np.int64(0), Plain(members)
 
 
 @njit_internal
-def finish(n_rows, k, members, observer, ancestors, to):
-    """Tell that a record has ended, unless it has failed, and write the state if it is wanted."""
-    is_known = to.health[1] == NONE
-    if is_known:
-        emit(observer, ENDED, n_rows, k, members, np.empty(0), ancestors)
-    if to.state.size:
-        _dump(k, members, to.state)
-        if not is_known:
-            to.state[:] = np.nan
+def advance(call, j, k, last, parts):
+    """Move the members from step k to the last one before, or at, row j."""
+    # Taken out of their tuples before the loop, which would count references at every step.
+    system, noise, members, X = call.system, call.noise, parts.members, parts.members.X
+    observer, nothing, ancestors = call.observer, call.nothing, call.resampling.ancestors
+    t0, dt, width = call.record.t0, system.dt, call.local.width
+    while k < last:
+        propagate(system, k, t0 + k * dt, process_normals(noise, k), width, X)
+        k += 1
+        emit(observer, FORECAST, j, k, members, nothing, ancestors)
 
 
-def ensemble_filter(
+@njit_internal
+def resample(call, j, k, n_weighted, parts):
+    """Resample if few members have the weight; whether that was so."""
+    members, z = parts.members, resampling_normals(call.noise, j, k)
+    return resample_if_few(
+        call.resampling, n_weighted, z, members.log_w, members.w, members.X, call.local
+    )
+
+
+def member_filter(
     name: str,
-    workspace: Callable,
-    update: Callable,
-    n_settings: int,
+    observe: Callable,
     *,
-    resampler: Callable = no_resampler,
-    resample: Callable = no_resampling,
+    start: Callable = start,
+    advance: Callable = advance,
+    resample: Callable = resample,
 ) -> EntryPoint:
     """Make a filter one compiled function for all systems and numbers of members.
 
     Parameters
     ----------
     name : str
-    workspace : njit function ``(system, local, settings) -> tuple``
-        Allocates, once per evaluation, what ``update`` needs besides the members, and reads the
-        filter's settings. ``system`` is a `SystemPointers`, ``local`` a `LocalPartition`: which of
-        all members are here.
-    update : njit function
-        ``(system, j, k, t, d, noise, members, local, work) -> Outcome``. Replaces the forecast
-        members by the analysis of observation j at step k, with normalised weights. What it
-        returns, and where it branches, is the same on all ranks.
-    n_settings : int
-        How many settings, as numbers, the filter has besides the number of members.
-    resampler, resample : njit functions, optional
-        ``(settings, order, n, local) -> workspace`` with an array ``ancestors``, and
-        ``(workspace, noise, j, k, n_weighted, members, local) -> whether members were resampled``.
+    observe : njit function ``(call, j, k, parts) -> Outcome``
+        Replaces the forecast members by the analysis of observation j at step k, with normalised
+        weights. ``call`` is an `Evaluation`. What it returns, and where it branches, is the same on
+        all ranks.
+    start : njit function ``call -> (k, parts)``, optional
+        Draws the members at step 0, or takes those of a state. ``parts`` is a named tuple with
+        ``members``, a `Members`, and what else the other functions need.
+    advance : njit function ``(call, j, k, last, parts)``, optional
+        Moves members from step k to the step ``last`` of row j.
+    resample : njit function ``(call, j, k, n_weighted, parts) -> bool``, optional
+        Whether members were resampled.
 
     Returns
     -------
     EntryPoint
         Writes ``terms``, ``n_effective`` of every term, which stays NaN where there is none, and
-        ``health`` (see `filters.protocol`). A filter of this package is cached
-        on disk; another one is compiled once per process.
+        ``health`` (see `filters.protocol`).
     """
 
     @njit_internal
     def evaluate(plan, record, request, seed, to):
-        given, steps, t0 = settings_of(plan), record.steps, record.t0
-        system = read_system(plan, record.theta, record.inputs)
-        n_members = int(given[0])
-        local = local_partition(rank_of(request), n_members, n_sums(system))
-        noise, fits = noise_of_rank(seed, request, given, steps, local)
-        if not fits:
-            return NORMALS
-        work = workspace(system, local, given[N_LEADING:])
-        resampling = resampler(given[N_LEADING:], plan[PLAN.order], system.n, local)
-        members = new_members(np.empty((system.n, local.size)), system.p, local)
-        width, dt, health = local.width, system.dt, to.health
-        observer = observer_of(request)
-        health[0], health[1], health[2] = n_members, NONE, -1
-        if system.failure != NONE:
-            health[0], health[1], health[2] = 0.0, system.failure, 0.0
-        nothing, ancestors = np.empty(0), resampling.ancestors
+        call, status = _read_evaluation(plan, record, request, seed)
+        if status != OK:
+            return status
+        steps, local, health = record.steps, call.local, to.health
+        health[0], health[1], health[2] = local.n_members, NONE, -1
+        if to.state.size:
+            to.state[:] = np.nan
+        if call.system.failure != NONE:
+            health[0], health[1], health[2] = 0.0, call.system.failure, 0.0
+            return OK
         origins = new_origins(plan[PLAN.follows_origins] != 0, local)
-        k = begin(plan, system, state_given(request), noise, width, members, observer, ancestors)
-        if k < 0:
-            return STATE
-        for j in range(steps.size if health[1] == NONE else 0):
-            while k < steps[j]:
-                propagate(system, k, t0 + k * dt, process_normals(noise, k), width, members.X)
-                k += 1
-                emit(observer, FORECAST, j, k, members, nothing, ancestors)
-            d = record.observed[j]
+        k, parts = start(call)
+        members, observer, nothing = parts.members, call.observer, call.nothing
+        ancestors = call.resampling.ancestors
+        for j in range(steps.size):
+            if k < steps[j]:
+                advance(call, j, k, steps[j], parts)
+                k = steps[j]
             if is_missing(record.observed, j):
                 to.terms[j] = 0.0
                 continue
-            found = update(system, j, k, t0 + k * dt, d, noise, members, local, work)
+            found = observe(call, j, k, parts)
             n_effective = found.n_effective
             if origins.own.size and found.failure == NONE:
                 n_distinct = effective_number_of_origins(origins, members.w, local)
@@ -242,14 +325,17 @@ def ensemble_filter(
             health[0] = min(health[0], n_effective)
             if found.failure != NONE:
                 health[1], health[2] = found.failure, j
-                break
+                return OK
             to.terms[j] = found.increment
-            emit(observer, UPDATED, j, k, members, d, ancestors)
-            if resample(resampling, noise, j, k, found.n_weighted, members, local):
+            emit(observer, UPDATED, j, k, members, record.observed[j], ancestors)
+            if resample(call, j, k, found.n_weighted, parts):
                 follow_ancestors(origins, ancestors)
                 emit(observer, RESAMPLED, j, k, members, nothing, ancestors)
-        finish(steps.size, k, members, observer, ancestors, to)
+        emit(observer, ENDED, steps.size, k, members, nothing, ancestors)
+        if to.state.size:
+            _leave(k, members, local, to.state)
         return OK
 
-    parts = (str(n_settings), workspace, update, resampler, resample)
-    return likelihood_entry(name, evaluate, parts, needs=(FILL_NORMALS,))
+    return likelihood_entry(
+        name, evaluate, (start, advance, observe, resample), needs=(FILL_NORMALS,)
+    )

@@ -1,11 +1,10 @@
 """What particle filters share: when and how they resample, and how they smooth."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import ClassVar
 
 from ...compiler.native.entry_point import EntryPoint
-from ...compiler.native.jit import njit_internal
 from ...compiler.native.plan import Plan
 from ..protocol import System
 from . import ancestral_smoother, backward_simulation
@@ -13,46 +12,7 @@ from .ancestral_smoother import CARRY_PAST, LAG
 from .backward_simulation import STORE
 from .base import EnsembleFilterBase, check_choice, check_count, check_fraction
 from .hilbert_sort import ORDER_PARTICLES
-from .loop import ensemble_filter
-from .noise import resampling_normals
-from .resampling import (
-    SCHEMES,
-    check_sortable,
-    n_normals,
-    resample_if_few,
-    resampler,
-    smooth_resampling,
-)
-
-_N_SETTINGS = 2  # threshold of resampling, number of its scheme
-
-
-@njit_internal
-def _resampler(settings, order, n, local):
-    return resampler(settings[0], int(settings[1]), order, n, local)
-
-
-@njit_internal
-def _resample(resampling, noise, j, k, n_weighted, members, local):
-    z = resampling_normals(noise, j, k)
-    return resample_if_few(resampling, n_weighted, z, members.log_w, members.w, members.X, local)
-
-
-def particle_filter(
-    name: str, workspace: Callable, update: Callable, n_settings: int = 0
-) -> EntryPoint:
-    """Make a particle filter one compiled function, see `loop.ensemble_filter`.
-
-    ``n_settings`` counts the filter's own settings; they follow those of the resampling.
-    """
-    return ensemble_filter(
-        name,
-        workspace,
-        update,
-        _N_SETTINGS + n_settings,
-        resampler=_resampler,
-        resample=_resample,
-    )
+from .resampling import SCHEMES, check_sortable, n_normals, smooth_resampling
 
 
 @dataclass(frozen=True)
@@ -78,8 +38,8 @@ class ParticleFilter(EnsembleFilterBase):
         """Return the number of particles."""
         return self.n_particles
 
-    def settings(self) -> tuple[float, ...]:
-        """Return the threshold of resampling and the number of its scheme."""
+    def when_to_resample(self) -> tuple[float, int]:
+        """Return below which fraction to resample, and the number of the scheme."""
         return self.resample_below, SCHEMES.index(self.resampling)
 
     def check(self, system: System) -> None:

@@ -39,11 +39,18 @@ from ...compiler.numerics.philox import PILOT
 from ..outcomes import is_missing
 from ..plan import log_density
 from .defence import LEAST_SHARE
-from .guided_moves import begin_interval, guided_particles, log_psi, move, start
-from .loop import n_sums
-from .noise import NoiseSizes, initial_rows, noise_of, resampling_normals
+from .guided_moves import begin_interval, draw_start, guided_particles, log_psi, move
+from .kalman_update import copy_members
+from .loop import Evaluation, Plain, n_sums, new_members, time_of
+from .noise import NoiseSizes, noise_of, resampling_normals
 from .reductions import RankLayout, local_partition
-from .resampling import resample, resampler
+from .resampling import (
+    choose_ancestors,
+    copy_ancestors,
+    gather_particles,
+    resample,
+    resampler,
+)
 
 _N = 2 * BLOCK  # particles
 _LAG = 4  # observations until the descendants of a path count
@@ -83,36 +90,57 @@ def _paths():
 
 
 @njit_internal
-def judge(system, record, guide, update, shares):
+def chosen_for_pilot(w, X, local):
+    """States (n, 128) among weighted particles of all ranks, at even distances of their weights."""
+    every, X_pilot = np.empty((1 + X.shape[0], local.n_members)), np.empty((X.shape[0], _N))
+    points, ancestors = (np.arange(_N) + 0.5) / _N, np.empty(_N, np.int64)
+    gather_particles(w, X, local, every)
+    choose_ancestors(every[0], points, np.empty(local.sums.shape[1]), ancestors)
+    copy_ancestors(every[1:], ancestors, X_pilot)
+    return X_pilot
+
+
+@njit_internal
+def judge(call, guide, observe, k, X, shares):
     """Write the share of unguided particles in every interval that begins behind an observation.
 
-    ``update`` is that of `bootstrap`.
+    ``observe`` is that of `bootstrap`. The pilot begins at step k with the states X (n, 128), or
+    where there are none at step 0 with draws.
     """
-    steps, none = record.steps, np.int64(0)
+    system, record, none = call.system, call.record, np.int64(0)
+    steps = record.steps
     local = local_partition(RankLayout(0, 1, 0), np.int64(_N), n_sums(system))
     sizes = NoiseSizes(_N, system.n, system.m, 0, BLOCK)
     n_steps = steps[-1] if steps.size else none
     noise = noise_of(np.int64(_SEED), np.empty(0), sizes, n_steps, none, PILOT)
     resampling = resampler(1.0, 0, none, system.n, local)
-    particles, paths = guided_particles(system.n, system.m, system.p, local), _paths()
-    members, before = particles.members, np.zeros(_N)
-    particles.unguided[:] = True
-    start(system, guide, initial_rows(noise), 1.0, particles, local)
-    k = first = seen = none
+    pilot = Evaluation(
+        plan=call.plan, system=system, record=record, state=call.nothing, settings=call.settings,
+        noise=noise, local=local, resampling=resampling, observer=(none, none, none),
+        nothing=call.nothing,
+    )  # fmt: skip
+    members, before, paths = new_members(system.n, system.p, local), np.zeros(_N), _paths()
+    particles = guided_particles(pilot, members, guide, call.nothing)
+    particles.unguided[:], particles.ahead[0] = True, 1.0
+    if X.shape[1] == 0:
+        draw_start(pilot, guide, 1.0, particles)
+    else:
+        copy_members(X, members.X)
+        log_psi(particles, none, k, X, before)
+    first = seen = none
     for j in range(steps.size):
-        move(system, guide, record, noise, k, steps[j], 1.0, particles, local)
+        move(pilot, k, steps[j], particles)
         k = steps[j]
         if is_missing(record.observed, j):
             continue
-        t, d = record.t0 + k * system.dt, record.observed[j]
-        found = update(system, j, k, t, d, noise, members, local, ())
+        found = observe(pilot, j, k, Plain(members))
         if found.failure:
             break
-        log_psi(guide, j, k, members.X, particles.log_v)
+        log_psi(particles, j + 1, k, members.X, particles.log_v)
         _record_moves(paths, seen, before, particles, found.increment, guide.sums[first, 1])
         paths.rows[seen % _LENGTH] = first
         resample(resampling, resampling_normals(noise, j, k), members.w, members.X, local)
-        if _folds(system, k, t, d, members, resampling.ancestors):
+        if _folds(pilot, j, k, members):
             for i in range(steps.size):
                 shares[i] = _SHARES[-1]
             return
@@ -130,14 +158,15 @@ def judge(system, record, guide, update, shares):
 
 
 @njit_internal
-def _folds(system, k, t, d, members, ancestors):
+def _folds(call, j, k, members):
     """Whether the sensor folds between resampled particles."""
+    ancestors, d = call.resampling.ancestors, call.record.observed[j]
     X, half, n_folds = members.X, _N // 2, 0
     between, log_p = np.empty(X.shape), np.empty(_N)
     for a in range(X.shape[0]):
         for i in range(_N):
             between[a, i] = 0.5 * (X[a, i] + X[a, (i + half) % _N])
-    log_density(system, k, t, d, between, log_p)
+    log_density(call.system, k, time_of(call, k), d, between, log_p)
     for i in range(half):
         worse = min(members.log_p[ancestors[i]], members.log_p[ancestors[i + half]])
         n_folds += log_p[i] < worse - _VALLEY
@@ -156,7 +185,7 @@ def _record_moves(paths, seen, before, particles, increment, evidence):
         total += exp(before[i] - largest)
     mean = largest + math.log(total / _N)
     for i in range(_N):
-        weight = particles.log_ratio[i] + log_det - before[i]
+        weight = members.behind[i] + log_det - before[i]
         rarity[i] = weight + mean
         excess[i] = weight + members.log_p[i] + particles.log_v[i] - evidence
 

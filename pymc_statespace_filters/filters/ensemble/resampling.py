@@ -72,12 +72,15 @@ class Resampling(NamedTuple):
 
 @njit_internal
 def resampler(fraction, scheme, order, n_states, local):
-    """Settings and scratch: resample below ``fraction`` of the particles, by scheme number."""
-    N = local.n_members
+    """Settings and scratch: resample below ``fraction`` of the particles, by scheme number.
+
+    Of a filter that never does, by a negative fraction, there is no scratch.
+    """
+    N, size = (local.n_members, local.size) if fraction >= 0.0 else (0, 0)
     n_ordered = N if order != 0 else 0
     return Resampling(
         fraction * N, scheme == _MULTINOMIAL, order, fraction == 1.0,
-        np.empty(N + 1), np.empty(local.size, np.int64),
+        np.empty(N + 1), np.empty(size, np.int64),
         np.empty((1 + n_states, N)), np.empty(local.sums.shape[1]),
         order_workspace(n_states, n_ordered), np.empty(n_ordered),
     )  # fmt: skip

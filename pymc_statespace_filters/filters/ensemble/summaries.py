@@ -1,4 +1,4 @@
-"""Callbacks that summarise or store weighted members: filtered states, and whole runs."""
+"""States that a filter with members reports, written by a callback: at draws, and of whole runs."""
 
 import math
 
@@ -12,17 +12,24 @@ from ...compiler.numerics.philox import STATES, uniform_at
 from ..calls import OK, first_unknown, opened, reals_at, wanted_rows
 from ..plan import PLAN
 from .callbacks import CALLBACK_ARGUMENTS, PREDICTED, UPDATED, run_observed, searchsorted
+from .loop import layout_of
+from .part_moments import choose, draw_of_mixture, mixture_moments
 from .weights import effective_number, normalise
 
 LAST_EVENTS = {"predicted": int(PREDICTED), "filtered": int(UPDATED)}
 """The last event at a step that a moment includes."""
 
-# Integers of the callbacks, then the steps of the rows. The last four are addresses of what a run
-# writes. Reals of the states: mean, sd, draw, each (R, n), and effective number (R,).
-_N_HEADER = 10
+# Integers of the callback; then the steps of the rows, and the order of the states.
+_N_HEADER = 15
 (
-    _N, _MEMBERS, _ROWS, _LAST_EVENT, _SEED, _NEXT, _MEAN, _COV, _STATES, _WEIGHTS,
+    _PART_ROWS, _MEMBERS, _ROWS, _LAST_EVENT, _SEED, _NEXT, _EXACT, _N, _MEAN, _SD, _COV,
+    _DRAWN, _EFFECTIVE, _STATES, _WEIGHTS,
 ) = range(_N_HEADER)  # fmt: skip
+_ADDRESSES = (
+    (_MEAN, RESULTS.mean), (_SD, RESULTS.sd), (_COV, RESULTS.cov), (_DRAWN, RESULTS.drawn),
+    (_EFFECTIVE, RESULTS.n_effective_wanted), (_STATES, RESULTS.members),
+    (_WEIGHTS, RESULTS.weights),
+)  # fmt: skip
 
 
 @inline_always
@@ -37,55 +44,56 @@ def current_row(integers, event, k):
 
 
 @njit_internal
-def _header(call, rows):
-    """The integers of a callback."""
-    integers, to = np.empty(_N_HEADER + rows.size, np.int64), call.results
-    integers[_N], integers[_MEMBERS] = call.plan[PLAN.n], call.plan[PLAN.n_members]
-    integers[_ROWS], integers[_LAST_EVENT] = rows.size, call.plan[PLAN.last_event]
+def _header(call, layout):
+    """The integers of the callback."""
+    rows, order, plan = wanted_rows(call), layout.order, call.plan
+    integers = np.empty(_N_HEADER + rows.size + order.size, np.int64)
+    integers[_PART_ROWS], integers[_MEMBERS] = layout.rows, plan[PLAN.n_members]
+    integers[_ROWS], integers[_LAST_EVENT] = rows.size, plan[PLAN.last_event]
     integers[_SEED], integers[_NEXT] = call.request[REQUEST.draw_seed], 0
-    integers[_MEAN], integers[_COV] = to[RESULTS.mean], to[RESULTS.cov]
-    integers[_STATES], integers[_WEIGHTS] = to[RESULTS.members], to[RESULTS.weights]
-    copy_into(integers[_N_HEADER:], rows)
+    integers[_EXACT], integers[_N] = layout.n_exact, order.size
+    for place, slot in _ADDRESSES:
+        integers[place] = call.results[slot]
+    copy_into(integers[_N_HEADER : _N_HEADER + rows.size], rows)
+    copy_into(integers[_N_HEADER + rows.size :], order)
     return integers
 
 
 def _summarise(integers, reals, event, j, k, X, log_w, d, D, ancestors):
-    header = carray(integers, (_N_HEADER,))
-    n, N, n_rows = header[_N], header[_MEMBERS], header[_ROWS]
     row = current_row(integers, event, k)
     if row >= 0:
-        members = carray(X, (n, N))
-        w = finite_weights(members, carray(log_w, (N,)))
-        out = carray(reals, ((3 * n + 1) * n_rows,))
-        summarise_row(out, n_rows, row, members, w, header[_SEED], k)
-
-
-def _store_members(integers, reals, event, j, k, X, log_w, d, D, ancestors):
-    header = carray(integers, (_N_HEADER,))
-    n, N = header[_N], header[_MEMBERS]
-    row = current_row(integers, event, k)
-    if row >= 0:
-        members = carray(X, (n, N))
-        w = finite_weights(members, carray(log_w, (N,)))
-        mean, cov, stored, weights = _stored(header)
-        for i in range(N):
-            weights[row, i] = w[i]
-            for a in range(n):
-                stored[row, i, a] = members[a, i]
-        if w.any():
-            mean_and_cov(w, members, mean[row], cov[row])
+        header = carray(integers, (_N_HEADER,))
+        parts = carray(X, (header[_PART_ROWS], header[_MEMBERS]))
+        w = finite_weights(parts, carray(log_w, (header[_MEMBERS],)))
+        first = _N_HEADER + header[_ROWS]
+        order = carray(integers, (first + header[_N],))[first:]
+        _write_row(header, row, k, order, parts, w)
 
 
 @njit_internal
-def _stored(header):
-    """Mean, covariance, members and weights of a run, as arrays of the results."""
-    n, N, R = header[_N], header[_MEMBERS], header[_ROWS]
-    return (
-        reals_at(header[_MEAN], (R, n)),
-        reals_at(header[_COV], (R, n, n)),
-        reals_at(header[_STATES], (R, N, n)),
-        reals_at(header[_WEIGHTS], (R, N)),
-    )
+def _write_row(header, row, k, order, parts, w):
+    """Write what is wanted of a row; addresses of other things are 0."""
+    n, N, R, n_exact = order.size, w.size, header[_ROWS], header[_EXACT]
+    if header[_STATES] != 0:
+        states = reals_at(header[_STATES], (R, N, n))[row]
+        copy_into(reals_at(header[_WEIGHTS], (R, N))[row], w)
+        for i in range(N):
+            for a in range(n):
+                states[i, a] = parts[order[a], i]
+    if not w.any():
+        return
+    n_effective, cov = effective_number(w), np.empty((n, n))
+    mean = reals_at(header[_MEAN], (R, n))[row]
+    mixture_moments(w, parts, n_exact, order, 1.0 - 1.0 / n_effective, mean, cov)
+    if header[_COV] != 0:
+        copy_into(reals_at(header[_COV], (R, n * n))[row], cov.reshape(n * n))
+    if header[_DRAWN] != 0:
+        sd = reals_at(header[_SD], (R, n))[row]
+        for a in range(n):
+            sd[a] = math.sqrt(max(cov[a, a], 0.0))
+        drawn = reals_at(header[_DRAWN], (R, n))[row]
+        draw_of_mixture(w, parts, n_exact, order, header[_SEED], k, drawn)
+        reals_at(header[_EFFECTIVE], (R,))[row] = n_effective
 
 
 @njit_internal
@@ -133,38 +141,7 @@ def _moments(w, X, mean, sd):
         sd[a] = math.sqrt(variance / spread) if spread > 0.0 else 0.0
 
 
-@njit_internal
-def mean_and_cov(w, X, mean, cov):
-    """Weighted mean and covariance of the members, the latter over 1 - sum w^2 (Eq. 4.33)."""
-    spread = 1.0 - 1.0 / effective_number(w)
-    for a in range(X.shape[0]):
-        mean[a] = 0.0
-        for i in range(w.size):
-            if w[i] > 0.0:
-                mean[a] += w[i] * X[a, i]
-        for b in range(a + 1):
-            total = 0.0
-            for i in range(w.size):
-                if w[i] > 0.0:
-                    total += w[i] * (X[a, i] - mean[a]) * (X[b, i] - mean[b])
-            cov[a, b] = cov[b, a] = total / spread if spread > 0.0 else 0.0
-
-
-@njit_internal
-def choose(w, u):
-    """The member in whose share of the whole weight a number of (0, 1) falls."""
-    chosen, cumulative = 0, 0.0
-    for i in range(w.size):
-        if w[i] > 0.0:
-            chosen = i
-            cumulative += w[i]
-            if u < cumulative:
-                break
-    return chosen
-
-
 SUMMARISE = EntryPoint(_summarise, CALLBACK_ARGUMENTS, "summarise")
-STORE_MEMBERS = EntryPoint(_store_members, CALLBACK_ARGUMENTS, "store_members")
 
 
 @njit_internal
@@ -191,37 +168,35 @@ def write_summaries(call, numbers, health, until):
     copy_into(reals_at(to[RESULTS.health], (HEALTH_SIZE,)), health)
 
 
+@njit_internal
+def _forget(call, n, first):
+    """Leave rows from this one on unknown."""
+    to, R, N = call.results, wanted_rows(call).size, call.plan[PLAN.n_members]
+    widths = (n, n, n * n, n, 1, N * n, N)
+    for i in range(len(_ADDRESSES)):
+        address = to[_ADDRESSES[i][1]]
+        if address != 0:
+            reals_at(address, (R * widths[i],))[first * widths[i] :] = np.nan
+
+
 def _states(plan, record, request, results):
+    """Moments, and draws or the members of a run, whichever are wanted."""
     status, call = opened(plan, record, request, results)
-    if status != OK or call.request[REQUEST.sizes_only]:
+    if status != OK:
         return status
-    rows, n = wanted_rows(call), call.plan[PLAN.n]
-    reals = np.full((3 * n + 1) * rows.size, np.nan)
-    integers = _header(call, rows)
-    status, _, health = run_observed(call, plan, record, integers, reals)
-    write_summaries(call, reals, health, first_unknown(call, health))
-    return status
-
-
-def _run(plan, record, request, results):
-    status, call = opened(plan, record, request, results)
-    if status != OK or call.request[REQUEST.sizes_only]:
+    layout, _ = layout_of(call.plan)
+    n, to = layout.order.size, call.results
+    to[RESULTS.n_states] = n
+    if call.request[REQUEST.sizes_only]:
         return status
-    rows, to, integers = wanted_rows(call), call.results, _header(call, wanted_rows(call))
-    mean, cov, members, weights = _stored(integers)
-    mean[:], cov[:], members[:], weights[:] = np.nan, np.nan, np.nan, np.nan
-    status, terms, health = run_observed(call, plan, record, integers, np.empty(0))
-    until = first_unknown(call, health)
-    for row in range(rows.size):
-        if rows[row] >= until:
-            mean[row], cov[row], members[row], weights[row] = np.nan, np.nan, np.nan, np.nan
-    copy_into(reals_at(to[RESULTS.terms], (terms.size,)), terms)
+    _forget(call, n, 0)
+    status, terms, health = run_observed(call, plan, record, _header(call, layout), np.empty(0))
+    _forget(call, n, searchsorted(wanted_rows(call), first_unknown(call, health), 0))
+    if to[RESULTS.terms] != 0:
+        copy_into(reals_at(to[RESULTS.terms], (terms.size,)), terms)
     copy_into(reals_at(to[RESULTS.health], (HEALTH_SIZE,)), health)
     return status
 
 
-MEMBER_STATES = plan_entry(_states, "ensemble_states")
-"""Predicted or filtered states, in one pass."""
-
-MEMBER_RUN = plan_entry(_run, "ensemble_run")
-"""One run that keeps all members at some steps."""
+STATES_OF_PARTS = plan_entry(_states, "states_of_parts")
+"""Predicted or filtered states, and whole runs, in one pass."""

@@ -38,7 +38,6 @@ from .states import states_plan
 class GaussianFilterBase(TapedFilter):
     """Compiles a filter from its ``linearization``."""
 
-    resumes: ClassVar[bool] = True
     resumes_many: ClassVar[bool] = True
 
     @property

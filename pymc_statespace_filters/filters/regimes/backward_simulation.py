@@ -29,10 +29,10 @@ from ...compiler.numerics.small_cholesky import (
     solve_lower,
     solve_lower_transposed,
 )
-from ..ensemble.summaries import choose, finite_weights
+from ..ensemble.part_moments import choose, normal_at
+from ..ensemble.summaries import finite_weights
 from ..ensemble.weights import normalise
 from ..plan import NULL, call_members
-from .moments import normal_at
 
 # Where a step leaves no spread, a state is taken to be within these of its mean: relative to the
 # deviation, and to the value itself.

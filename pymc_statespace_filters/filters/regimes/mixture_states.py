@@ -11,6 +11,7 @@ import numpy as np
 from ...compiler.native.jit import copy_into, njit_internal
 from ...compiler.native.plan import REQUEST, RESULTS, Plan, plan_entry
 from ..calls import ALL_STEPS, OK, opened, wanted_rows
+from ..ensemble.part_moments import draw_of_mixture
 from ..ensemble.summaries import write_summaries
 from ..gaussian.functions import (
     GaussianFilterFunctions,
@@ -35,7 +36,6 @@ from ..plan import PLAN, make_plan, settings_of
 from ..protocol import System
 from .backward_simulation import Mixtures, simulate_backward
 from .hybrid import Hybrid
-from .moments import draw_of_mixture
 from .moves import moves_of_parts
 
 # The number of settings of covariances, of finite states, of regimes, and of draws in a step.

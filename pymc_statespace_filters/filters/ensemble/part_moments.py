@@ -1,7 +1,7 @@
-"""Moments and draws of a weighted mixture over regimes, a column for each of its parts.
+"""Moments and draws of weighted parts, a column for each, see `state_law`.
 
-A column holds a regime, then mean and lower triangle of the covariance of the continuous states.
-``order`` tells where each state of the system is among the finite states, followed by the others.
+A column holds exact values of some states, then mean and lower triangle of the covariance of the
+others. ``order`` tells where each state of the system is among the exact ones and these.
 """
 
 import math
@@ -11,11 +11,23 @@ import numpy as np
 from ...compiler.native.jit import njit_internal
 from ...compiler.numerics.philox import STATES, uniform_at
 from ...compiler.numerics.small_cholesky import covariance_root
-from ..ensemble.summaries import choose
 
 
 @njit_internal
-def mixture_moments(w, X, n_finite, order, spread, mean, cov):
+def choose(w, u):
+    """The part in whose share of the whole weight a number of (0, 1) falls."""
+    chosen, cumulative = 0, 0.0
+    for i in range(w.size):
+        if w[i] > 0.0:
+            chosen = i
+            cumulative += w[i]
+            if u < cumulative:
+                break
+    return chosen
+
+
+@njit_internal
+def mixture_moments(w, X, n_exact, order, spread, mean, cov):
     """Mean and covariance of the whole state; that between the parts is divided by ``spread``."""
     n = order.size
     for a in range(n):
@@ -26,7 +38,7 @@ def mixture_moments(w, X, n_finite, order, spread, mean, cov):
     for a in range(n):
         for b in range(a + 1):
             within, between = 0.0, 0.0
-            row = _row_of_cov(n, n_finite, order[a], order[b])
+            row = _row_of_cov(n, n_exact, order[a], order[b])
             for i in range(w.size):
                 if w[i] > 0.0:
                     between += w[i] * (X[order[a], i] - mean[a]) * (X[order[b], i] - mean[b])
@@ -35,21 +47,21 @@ def mixture_moments(w, X, n_finite, order, spread, mean, cov):
 
 
 @njit_internal
-def _row_of_cov(n, n_finite, a, b):
+def _row_of_cov(n, n_exact, a, b):
     """The row of the covariance of two numbers of a column; -1 if one is known given the regime."""
-    i, j = max(a, b) - n_finite, min(a, b) - n_finite
+    i, j = max(a, b) - n_exact, min(a, b) - n_exact
     return n + i * (i + 1) // 2 + j if j >= 0 else -1
 
 
 @njit_internal
-def draw_of_mixture(w, X, n_finite, order, seed, place, out):
+def draw_of_mixture(w, X, n_exact, order, seed, place, out):
     """A draw of the whole state, that of ``place``."""
     n, part = order.size, choose(w, uniform_at(seed, STATES, place, 0))
-    n_normal = n - n_finite
+    n_normal = n - n_exact
     root, drawn = np.empty((n_normal, n_normal)), np.empty(n)
     for i in range(n_normal):
         for j in range(i + 1):
-            row = _row_of_cov(n, n_finite, n_finite + i, n_finite + j)
+            row = _row_of_cov(n, n_exact, n_exact + i, n_exact + j)
             root[i, j] = root[j, i] = X[row, part]
     covariance_root(root)
     for a in range(n):
@@ -57,7 +69,7 @@ def draw_of_mixture(w, X, n_finite, order, seed, place, out):
     for j in range(n_normal):
         z = normal_at(seed, place, 1 + 2 * j)
         for i in range(j, n_normal):
-            drawn[n_finite + i] += root[i, j] * z
+            drawn[n_exact + i] += root[i, j] * z
     for a in range(n):
         out[a] = drawn[order[a]]
 
