@@ -7,9 +7,10 @@ import numpy as np
 
 from ..compiler.native.entry_point import EntryPoint
 from ..compiler.native.jit import inline_always
+from .ensemble.evaluation import time_of
 from .ensemble.failures import failure_of_all
 from .ensemble.kalman_update import mark_finite
-from .ensemble.loop import Outcome, failed, member_filter, time_of
+from .ensemble.loop import Outcome, failed, member_filter
 from .ensemble.particle_filter import ParticleFilter
 from .ensemble.weights import normalise_weights
 from .outcomes import NONE

@@ -14,6 +14,7 @@ from ..compiler.numerics.small_cholesky import log_gaussian
 from ..errors import ModelError
 from .ensemble.ancestral_smoother import CARRY_PAST, NO_LAG, SMOOTH
 from .ensemble.base import EnsembleFilterBase, check_choice, check_count
+from .ensemble.evaluation import Members, time_of
 from .ensemble.failures import failure_of_all
 from .ensemble.kalman_update import (
     Moments,
@@ -24,7 +25,7 @@ from .ensemble.kalman_update import (
     mark_finite,
     moments_workspace,
 )
-from .ensemble.loop import Members, Outcome, failed, member_filter, time_of
+from .ensemble.loop import Outcome, failed, member_filter
 from .ensemble.loop import start as start_members
 from .ensemble.noise import NoiseSizes, observation_normals
 from .outcomes import NONE, SINGULAR

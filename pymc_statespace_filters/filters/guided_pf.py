@@ -18,6 +18,7 @@ from ..compiler.native.plan import Plan
 from ..errors import ModelError
 from .bootstrap import observe
 from .ensemble.defence import choose_unguided, least_share, share_at_start
+from .ensemble.evaluation import new_members, restore
 from .ensemble.guide import initial_law, law_of_particles, make_guide
 from .ensemble.guided_moves import (
     begin_interval,
@@ -31,7 +32,7 @@ from .ensemble.guided_moves import (
 )
 from .ensemble.guided_predictions import copy_again, move_copies, start_copies
 from .ensemble.kalman_update import mark_finite
-from .ensemble.loop import Outcome, Plain, failed, member_filter, new_members, restore
+from .ensemble.loop import Outcome, Plain, failed, member_filter
 from .ensemble.particle_filter import ParticleFilter
 from .ensemble.pilot import chosen_for_pilot, judge
 from .ensemble.weights import normalise_weights

@@ -10,6 +10,7 @@ from ..compiler.native.jit import inline_always, njit_internal
 from ..errors import ModelError
 from .bootstrap import BootstrapPF
 from .ensemble.base import check_choice
+from .ensemble.evaluation import Members, time_of
 from .ensemble.failures import failure_of_all
 from .ensemble.kalman_update import (
     copy_members,
@@ -18,7 +19,7 @@ from .ensemble.kalman_update import (
     kalman_update,
     mark_finite,
 )
-from .ensemble.loop import Members, Outcome, failed, member_filter, time_of
+from .ensemble.loop import Outcome, failed, member_filter
 from .ensemble.loop import start as start_members
 from .ensemble.noise import observation_normals
 from .ensemble.particle_filter import ParticleFilter

@@ -18,19 +18,10 @@ from ..compiler.numerics.normals import padded
 from .ekf import EKF
 from .ensemble.backward_simulation import STORE
 from .ensemble.callbacks import FORECAST
+from .ensemble.evaluation import Members, members_with, show, time_of
 from .ensemble.failures import failure_of_all
 from .ensemble.kalman_update import mark_finite
-from .ensemble.loop import (
-    Members,
-    Outcome,
-    advance,
-    failed,
-    member_filter,
-    members_with,
-    show,
-    start,
-    time_of,
-)
+from .ensemble.loop import Outcome, advance, failed, member_filter, start
 from .ensemble.noise import NoiseSizes, process_normals
 from .ensemble.particle_filter import ParticleFilter
 from .ensemble.resampling import check_sortable, smooth_resampling

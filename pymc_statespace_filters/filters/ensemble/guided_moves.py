@@ -9,8 +9,8 @@ from ...compiler.native.jit import inline_always, keep_alive, njit_internal
 from ..plan import initialise, propagate_guided
 from .callbacks import FORECAST
 from .defence import choose_unguided, mixture_weight, place_of_unguided, undo_guide
+from .evaluation import Members, members_with, show
 from .guide import leave_unguided
-from .loop import Members, members_with, show
 from .noise import initial_rows, process_normals, process_rows, resampling_normals
 from .reductions import FIRST_ROW, allgather_sums, sum_squares, total
 from .resampling import resample

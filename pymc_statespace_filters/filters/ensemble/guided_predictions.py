@@ -11,7 +11,7 @@ import numpy as np
 from ...compiler.native.jit import copy_into, njit_internal
 from ..plan import initialise, propagate_guided
 from .callbacks import PREDICTED
-from .loop import members_with, show, time_of
+from .evaluation import members_with, show, time_of
 from .noise import initial_rows, process_normals
 
 _NUMBER_BYTES = 8

@@ -39,9 +39,10 @@ from ...compiler.numerics.philox import PILOT
 from ..outcomes import is_missing
 from ..plan import log_density
 from .defence import LEAST_SHARE
+from .evaluation import Evaluation, n_sums, new_members, time_of
 from .guided_moves import begin_interval, draw_start, guided_particles, log_psi, move
 from .kalman_update import copy_members
-from .loop import Evaluation, Plain, n_sums, new_members, time_of
+from .loop import Plain
 from .noise import NoiseSizes, noise_of, resampling_normals
 from .reductions import RankLayout, local_partition
 from .resampling import (

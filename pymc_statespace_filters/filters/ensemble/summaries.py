@@ -12,7 +12,7 @@ from ...compiler.numerics.philox import STATES, uniform_at
 from ..calls import OK, first_unknown, opened, reals_at, wanted_rows
 from ..plan import PLAN
 from .callbacks import CALLBACK_ARGUMENTS, PREDICTED, UPDATED, run_observed, searchsorted
-from .loop import layout_of
+from .evaluation import layout_of
 from .part_moments import choose, draw_of_mixture, mixture_moments
 from .weights import effective_number, normalise
 

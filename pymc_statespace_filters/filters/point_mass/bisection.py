@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compiler.native.jit import copy_into, njit_internal
+from ...compiler.native.jit import njit_internal
 from ...compiler.numerics.order import stable_order
 from ..observation_failures import observation_failure
 from ..outcomes import GRID_TOO_LARGE, NO_PROCESS_NOISE, NONE, STATE_NOT_FINITE, ZERO_DENSITY
@@ -128,15 +128,6 @@ def resolved_segments(system, step, first_segments, density, source, accuracy):
                 fresh[f], fresh[f + 1] = p, n
                 f, n = f + 2, n + 1
     return NONE, _in_order(segments, n, total), top + math.log(total)
-
-
-@njit_internal
-def segments_of_law(law):
-    """(code, segments, number): those of a law on segments."""
-    segments, n = empty_segments(MAX_SEGMENTS), law.low.size
-    copy_into(segments.low[:n], law.low)
-    copy_into(segments.high[:n], law.high)
-    return np.int64(NONE), segments, n
 
 
 @njit_internal

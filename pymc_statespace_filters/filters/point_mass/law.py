@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...compiler.native.jit import copy_into, njit_internal
+from ..outcomes import NONE
 from ..state_law import StateLaw
+from .bisection import empty_segments
 from .grid import MAX_POINTS, normalise
 from .moments import mean_and_sd
 from .recursion import initial_moments
@@ -171,6 +173,15 @@ def on_segments(law):
     if n == 0:
         masses[0, 0] = 1.0
     return Law(law.k, np.int64(OF_SEGMENTS), law.mean, law.sd, law.first, h, low, high, masses)
+
+
+@njit_internal
+def segments_of_law(law):
+    """(code, segments, number): those of a law on segments."""
+    segments, n = empty_segments(MAX_SEGMENTS), law.low.size
+    copy_into(segments.low[:n], law.low)
+    copy_into(segments.high[:n], law.high)
+    return np.int64(NONE), segments, n
 
 
 @njit_internal

@@ -15,7 +15,6 @@ from .bisection import (
     Step,
     known_point,
     resolved_segments,
-    segments_of_law,
     segments_of_mixture,
 )
 from .forward_pass import (
@@ -29,7 +28,7 @@ from .forward_pass import (
     first_attempt,
     next_attempt,
 )
-from .law import OF_SEGMENTS, density_of_law, law_before, on_segments
+from .law import OF_SEGMENTS, density_of_law, law_before, on_segments, segments_of_law
 from .recursion import TOO_COARSE, TOO_SHORT, is_known, truncation_of
 from .segments import POINTS, density, mixture
 

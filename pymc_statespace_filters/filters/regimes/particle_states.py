@@ -6,7 +6,7 @@ from ...compiler.native.plan import RECORD, REQUEST, RESULTS, plan_entry
 from ..calls import ALL_STEPS, OK, opened, single_record, wanted_rows
 from ..ensemble.backward_simulation import n_paths_of
 from ..ensemble.callbacks import run_observed
-from ..ensemble.loop import layout_of
+from ..ensemble.evaluation import layout_of
 from ..ensemble.summaries import write_summaries
 from ..outcomes import NONE
 from ..plan import PLAN, read_system
