@@ -17,8 +17,10 @@ def _(fact: Refusal) -> list[str]:
 
 @sentences.register
 def _(fact: Bias) -> list[str]:
-    others = listed(f for f in filters_for(fact.system) if is_unbiased(fact.system, f))
-    return [f"{others or 'no filter of the package'} has none"]
+    others = [f for f in filters_for(fact.system) if is_unbiased(fact.system, f)]
+    if not others:
+        return ["no filter of the package is without one"]
+    return [f"{listed(others)} {'have' if len(others) > 1 else 'has'} none"]
 
 
 @sentences.register

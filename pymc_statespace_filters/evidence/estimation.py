@@ -222,9 +222,9 @@ def estimate_evidence(
         that is due to the draws is reduced by more draws alone.
     exchangeable : str or list, optional
         The free variables with labels that may be exchanged, as those of K regimes:
-        ``["mean", "P"]``. They are along one or more axes of a variable; a tuple
-        ``("low", "high")`` has scalars of one label each, and a scalar is the share w of the first
-        of two, of which the other one has 1 - w. All K! orders are then counted, whether the draws
+        ``["mean", "P"]``. They are along one or more axes of a variable; a tuple in the list,
+        ``[("low", "high")]``, has scalars of one label each, and a scalar is the share w of the
+        first of two, of which the other one has 1 - w. All K! orders are then counted, whether the draws
         visit all of them, a transform keeps one, or the chains stay in one. ``()`` says that there
         are none. Without the argument, an evidence of labels that the density lets exchange is
         doubted.

@@ -154,8 +154,9 @@ def _declared(given: Sequence[Any], model: pm.Model, values: Mapping[str, Array]
     ]
     if not found:
         raise ModelError(
-            "exchangeable must name a vector, or a tuple of scalars, and other variables with as "
-            f"many labels: along an axis, or the share of the first of two; got {given}"
+            "exchangeable must name a vector, or a tuple of scalars in a list, as [('low', 'high')]"
+            ", and other variables with as many labels: along an axis, or the share of the first "
+            f"of two; got {given}"
         )
     return found
 

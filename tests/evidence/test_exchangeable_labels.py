@@ -119,6 +119,7 @@ def test_an_order_that_is_half_of_an_asymmetric_prior_is_improper():
     [("nu", r"free variables of the model, \['mu', 'w'\], got \['nu'\]"),
      (3, r"free variables of the model, \['mu', 'w'\], got \[3\]"),
      (["w"], "must name a vector, or a tuple of scalars"),
+     (("w", "w"), r"a tuple of scalars in a list, as \[\('low', 'high'\)\]"),
      (["mu", ("w", "w", "w")], "must name a vector, or a tuple of scalars")],
 )  # fmt: skip
 def test_bad_declarations(exchangeable, message):
