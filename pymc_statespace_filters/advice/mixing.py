@@ -27,10 +27,12 @@ def mixing_problem(fact: EndedRun, ways: Ways) -> str | None:
             f"{request.chains * request.draws} draws in all are too few to be sure that the chains "
             f"have mixed: {found.described(fact.names)}. Give more draws."
         )
-    text = f"The chains have not mixed: {found.described(fact.names)}. "
+    is_mixed = found.rhat.max() <= MAX_RHAT
+    what = "The draws are worth too little" if is_mixed else "The chains have not mixed"
+    text = f"{what}: {found.described(fact.names)}. "
     if found.least_ess < enough:
         text += f"{_needed(fact, found, enough)} (until_ess={enough:g} does it). "
-    if found.rhat.max() > MAX_RHAT:
+    if not is_mixed:
         remedy = alternatives(ways(fact.names[int(found.rhat.argmax())]))
         text += f"If R-hat stays above {MAX_RHAT}, {remedy}."
     return text.strip()

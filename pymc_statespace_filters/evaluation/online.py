@@ -142,6 +142,25 @@ class OnlineFilter:
         self._steps.passed(place, datum)
         return row
 
+    def advance(
+        self, *, step: int | None = None, time: float | None = None, inputs: Any = None
+    ) -> Prediction:
+        """Stand at a later step or time without a row, as where an input changes.
+
+        Arguments are of `update`, and the state there is that of `predict`.
+        """
+        missing = np.full(self._system.p, np.nan)
+        place, points, found = self._evaluated(missing, step, time, inputs)
+        prediction = self._predicted(place, found)
+        is_alive = found.codes == NONE
+        points.keep(None if is_alive.all() else is_alive)
+        self._theta, self._seeds = self._theta[is_alive], self._seeds[is_alive]
+        log_weights = self._log_weights[is_alive]
+        self._log_weights = log_weights - np.logaddexp.reduce(log_weights)
+        self._points = points
+        self._steps.passed(place, None)
+        return prediction
+
     def _evaluated(
         self, datum: Array, step: int | None, time: float | None, inputs: Any
     ) -> tuple[Place, FilterSteps, Step]:
@@ -170,7 +189,11 @@ class OnlineFilter:
         self, *, step: int | None = None, time: float | None = None, inputs: Any = None
     ) -> Prediction:
         """The state at a later step or time, given the rows so far; arguments as of `update`."""
-        place, _, found = self._evaluated(np.full(self._system.p, np.nan), step, time, inputs)
+        missing = np.full(self._system.p, np.nan)
+        place, _, found = self._evaluated(missing, step, time, inputs)
+        return self._predicted(place, found)
+
+    def _predicted(self, place: Place, found: Step) -> Prediction:
         _, codes, mean, cov = found
         is_alive = codes == NONE
         if not is_alive.any():
@@ -193,8 +216,8 @@ class OnlineFilter:
             raise ModelError(f"observed must be finite, or NaN where it is missing, got {numbers}")
         if all(map(math.isnan, numbers)):
             raise ModelError(
-                "observed has no number: a row that is wholly missing is not given; predict gives "
-                "the state at its time"
+                "observed has no number: use advance where there is no row, or predict, which "
+                "leaves the filter where it is"
             )
         return datum
 
@@ -257,10 +280,14 @@ def online(
     check_system_and_filter(system, filter)
     tell_of_choice(system, filter)
     if not isinstance(filter, ResumableFilter):
-        raise ModelError(f"{type(filter).__name__} cannot go on from its state")
-    theta = np.atleast_2d(flat_parameters(system, params))
-    if theta.ndim != 2 or not len(theta):
-        raise ModelError(f"params must be numbers or draws along one dimension, got {theta.shape}")
+        raise ModelError(
+            f"{type(filter).__name__} leaves no state from which it could go on, as the filters of "
+            "the package do"
+        )
+    theta = flat_parameters(system, params)
+    theta = theta.reshape(-1, theta.shape[-1])  # of all chains
+    if not len(theta):
+        raise ModelError("params must be numbers or draws, got arrays of length 0")
     identity = system.fingerprint, repr(filter), blake2b(theta.tobytes()).hexdigest()
     if state is not None:
         if not isinstance(state, OnlineState):

@@ -104,11 +104,13 @@ class RowSteps:
         axis = TimeAxis(np.array([place.step]), self._t0, system.dt, starts, lengths)
         return InputRows(first, columns_between(system, own, first, axis, self.resets))
 
-    def passed(self, place: Place, datum: Array) -> None:
-        """Stand behind a row (p,)."""
+    def passed(self, place: Place, datum: Array | None) -> None:
+        """Stand behind a row (p,); None: at its place, where no row is."""
         self.step, self.time, self.is_on_grid = place.step, place.time, place.is_on_grid
         if self._system.accumulators:
-            self.resets = resets_at(self._system, datum)
+            self.resets = np.zeros(len(self._system.accumulators))
+            if datum is not None:
+                self.resets = resets_at(self._system, datum)
 
 
 def numbers_of_row(name: str, value: Any, components: Sequence[str], role: str) -> Array:

@@ -37,8 +37,8 @@ class Failure(OutcomeCode):
     COVARIANCE_NOT_POSITIVE = (
         2,
         "by rounding errors, the covariance of the predicted state is not positive definite",
-        "Use units in which states and observables have similar sizes, or a larger "
-        "observation_noise",
+        "If the equations change much within a step, make the steps shorter; otherwise use units "
+        "in which states and observables have similar sizes, or a larger observation_noise",
     )
     ZERO_DENSITY = (
         3,

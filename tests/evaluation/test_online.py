@@ -174,6 +174,31 @@ def test_a_prediction_changes_nothing():
     assert tracker.update(DATA[1], step=2)[0] == other.update(DATA[1], step=2)[0]
 
 
+@pytest.mark.parametrize("resets", ["seen", "row"])
+def test_an_advance_is_no_row(resets):
+    """Inputs change between the rows, as by a switch; sums go on."""
+    system = psf.StateSpaceModel(
+        psf.EulerMaruyama(lambda x, u, a: [u[0] - a * x[0], x[0]], [[0.4], [0.0]], dt=0.5),
+        observation=lambda x: [x[1]], observation_noise=[[0.1]], inputs=["force"],
+        initial_mean=[1.0, 0.0], initial_cov=np.diag([0.2, 0.0]),
+        states=["rate", "sum"], accumulators=["sum"], resets=resets,
+    )  # fmt: skip
+    tracker, force = psf.online(system, psf.EKF(), {"a": 0.7}), [0.0, 0.0, 2.0, 2.0, 2.0, -1.0]
+    rows = [tracker.update(0.4, step=1, inputs=0.0)]
+    tracker.advance(step=2, inputs=0.0)
+    ahead = tracker.predict(step=5, inputs=2.0)
+    assert (tracker.advance(step=5, inputs=2.0).mean == ahead.mean).all()
+    rows.append(tracker.update(0.9, step=6, inputs=-1.0))
+    record = {"steps": [1, 6], "inputs": np.array(force)}
+    assert_same(rows, run_of(system, psf.EKF(), {"a": 0.7}, [0.4, 0.9], tracker, **record))
+
+
+def test_draws_of_chains_are_draws():
+    draws = np.array([[0.2, 0.9], [1.4, 0.5]])
+    whole, flat = (psf.online(ONE_STATE, psf.EKF(), {"a": a}) for a in (draws, draws.ravel()))
+    assert whole.update(0.3, step=1).log_likelihood == flat.update(0.3, step=1).log_likelihood
+
+
 @pytest.mark.parametrize("filter", [psf.EKF(), psf.BootstrapPF(50)], ids=repr)
 @pytest.mark.parametrize("params", [{"a": 0.9}, {"a": np.array([0.4, 0.9])}])
 def test_a_state_goes_on_elsewhere(filter, params):
