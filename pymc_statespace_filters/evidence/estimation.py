@@ -224,10 +224,10 @@ def estimate_evidence(
         The free variables with labels that may be exchanged, as those of K regimes:
         ``["mean", "P"]``. They are along one or more axes of a variable; a tuple in the list,
         ``[("low", "high")]``, has scalars of one label each, and a scalar is the share w of the
-        first of two, of which the other one has 1 - w. All K! orders are then counted, whether the draws
-        visit all of them, a transform keeps one, or the chains stay in one. ``()`` says that there
-        are none. Without the argument, an evidence of labels that the density lets exchange is
-        doubted.
+        first of two, of which the other one has 1 - w. All K! orders are then counted, whether the
+        draws visit all of them, a transform keeps one, or the chains stay in one. ``()`` says that
+        there are none. Without the argument, an evidence of labels that the density lets exchange
+        is doubted.
     random_seed : int or numpy.random.Generator, optional
         Seed. Each estimator gets its own stream, independent of which others run.
     extend_inferencedata : bool
