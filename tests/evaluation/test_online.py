@@ -56,6 +56,17 @@ def test_rows_are_those_of_a_run(filter):
     assert_same(rows, run_of(OSCILLATOR, filter, PARAMS, DATA, tracker, steps=STEPS))
 
 
+@pytest.mark.parametrize("filter", [psf.GuidedPF(200), psf.GridFilter()], ids=repr)
+def test_rows_are_those_of_a_run_that_goes_on_row_by_row(filter):
+    """Of filters that look ahead, or whose state is rounded to what they need."""
+    tracker, run = psf.online(ONE_STATE, filter, {"a": 0.9}, random_seed=3), None
+    seed = int(tracker.state.seeds[0])
+    for k, y in zip(STEPS, DATA[:, 0], strict=True):
+        row, given = tracker.update(y, step=int(k)), {"steps": [k], "seed": seed, "state": run}
+        run = psf.run_filter(ONE_STATE, filter, {"a": 0.9}, [y], **given)
+        assert_same([row], run)
+
+
 @pytest.mark.parametrize("times", [STEPS * 0.1, np.array([0.0, 0.1, 0.234, 0.5, 0.9, 1.05])])
 def test_times_on_the_grid_and_off_it(times):
     tracker = psf.online(OSCILLATOR, psf.EKF(), PARAMS)
