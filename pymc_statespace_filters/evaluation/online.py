@@ -238,11 +238,12 @@ def online(
     system : StateSpaceModel
     filter : a filter of the package, or a user's own that goes on from its state
     params : mapping
-        Parameter values by name; or draws of them, arrays with a first dimension of length M (a
-        declared parameter's own shape comes last). Draws are a mixture with equal weights at the
-        start, which follow the likelihood of the rows.
+        Parameter values by name; or draws of them, arrays with leading dimensions, such as chain
+        and draw (a declared parameter's own shape comes last). Draws are a mixture with equal
+        weights at the start, which follow the likelihood of the rows.
     state : OnlineState, optional
-        The ``state`` of another online filter of this system, filter and parameters, to go on from.
+        The ``state`` of another online filter of this system, filter and parameters, to go on from,
+        with its ``t0`` and its noise.
     t0 : float
         The time of step 0, where ``initial_mean`` and ``initial_cov`` hold.
     random_seed : int or numpy.random.Generator, optional
@@ -252,13 +253,19 @@ def online(
     -------
     OnlineFilter
         ``update(observed, step= | time=, inputs=None)`` gives a `Row`, ``predict(step= | time=,
-        inputs=None)`` a `Prediction`; ``state`` pickles.
+        inputs=None)`` a `Prediction`, as does ``advance``, which stands there; ``state`` pickles.
 
     Raises
     ------
     ModelError
         If the filter cannot treat the system or cannot go on from a state, parameters do not fit,
         or the state is of another system, filter or parameters.
+
+    Notes
+    -----
+    Rows on the grid have the bits of `run_filter` over all rows; `FiniteStateFilter` differs by
+    rounding, and `GridFilter` within its tolerance. `GuidedPF`, whose particles move by the rows to
+    come, sees one at a time: its estimate is another one, unbiased as well.
 
     Examples
     --------
