@@ -8,7 +8,7 @@ from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Constant
 
 from ..compiler.lowering.compiled_system import compile_system
-from ..compiler.lowering.directions import Directions, directions_of
+from ..compiler.lowering.directions import Directions
 from ..errors import ModelError
 from ..system.model import StateSpaceModel
 from ..system.time_axis import TimeAxis
@@ -33,7 +33,7 @@ def check_exact_rows(
     compiled = compile_system(system)
     if not (isinstance(observed, np.ndarray) and compiled.has_exact_sensor):
         return
-    directions, start = directions_of(compiled.asked), 0
+    directions, start = compiled.directions, 0
     for number, axis in enumerate(axes):
         rows = observed[start : start + axis.steps.size]
         if (found := _singular_row(directions, axis.steps, rows)) is not None:

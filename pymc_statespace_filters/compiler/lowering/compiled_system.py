@@ -13,6 +13,7 @@ from ..codegen.functions import member_function
 from ..native.entry_point import EntryPoint
 from . import quantiles, structure
 from .constants import covariances, extend, followed_by_square_roots, lowered, pull_back
+from .directions import Directions, directions_of
 from .guidance import guided_noise, linearize_step, n_gains, observation_information
 from .guide_loops import follow, look_back
 from .jumps import jumping_equations, jumping_parameters, stepped_parameters
@@ -324,6 +325,11 @@ class CompiledSystem:
     def has_exact_sensor(self) -> bool:
         """Whether a sensor has no noise; False if unknown."""
         return structure.has_exact_sensor(self.asked)
+
+    @cached_property
+    def directions(self) -> Directions:
+        """How many numbers are random at the start and in a step, and which sensors are exact."""
+        return directions_of(self.asked)
 
     @cached_property
     def start_over_noise(self) -> float:
