@@ -268,7 +268,11 @@ def test_ctrl_c_in_a_later_round_returns_what_is_there(model, stopped, tmp_path,
         part = draws_of(sample_dram(model, checkpoint=tmp_path, **RULE))
     assert rounds[:1] == [RULE["tune"] + 150]
     assert 100 <= part.shape[1] <= 150
-    np.testing.assert_array_equal(part, draws_of(stopped)[:, : part.shape[1]])
+    # Of chains of different lengths those are returned that together have most draws.
+    begun = [whole[: part.shape[1]] for whole in draws_of(stopped)]
+    same = [[i for i, one in enumerate(begun) if np.array_equal(one, own)] for own in part]
+    assert all(len(found) == 1 for found in same)
+    assert len({found[0] for found in same}) == len(part) >= 2
     assert_identical(sample_dram(model, checkpoint=tmp_path, **RULE), stopped)
 
 
