@@ -7,10 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from pymc.model import Model
 
+from ..compiler.lowering.compiled_system import compile_system
+from ..filters.catalog import quiet_filter
 from ..filters.protocol import EnsembleFilter, Filter, properties
 from ..filters.written import short_form
-from ..pymc_model.inspection import noisy_filters
-from ..pymc_model.quieter_filter import quieter_filter
+from ..pymc_model.inspection import noisy_filters, state_space_nodes
 from ..sampling.kernel.state import draw_seeds
 from ..sampling.output.facts import NoisyStart, NoisyStarts
 from ..sampling.output.likelihood_variance import (
@@ -88,7 +89,7 @@ def _(fact: NoisyStarts) -> list[str]:
 @sentences.register
 def _(fact: SlowVariance) -> list[str]:
     """More particles hardly make the estimates less noisy."""
-    other = quieter_filter(fact.model, fact.name)
+    other = _quieter_filter(fact.model, fact.name)
     remedy = "" if other is None else f". Use {short_form(other)}, which has less noise here"
     return [f"{fact.name}: {fact.measured}{remedy}"]
 
@@ -174,8 +175,14 @@ def _quieter(model: Model) -> dict[str, Filter] | None:
     """Filters with little noise and the same posterior; None if a variable has none."""
     found = {}
     for name, filter in noisy_filters(model).items():
-        other = quieter_filter(model, name) if properties(filter).unbiased else None
+        other = _quieter_filter(model, name) if properties(filter).unbiased else None
         if other is None:
             return None
         found[name] = other
     return found
+
+
+def _quieter_filter(model: Model, name: str) -> Filter | None:
+    """A filter of the same likelihood with little noise or none, for one variable."""
+    op = state_space_nodes(model)[name].op
+    return quiet_filter(compile_system(op.system), op.filter)

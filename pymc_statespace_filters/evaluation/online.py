@@ -133,14 +133,14 @@ class OnlineFilter:
         datum = self._checked(observed)
         place, points, found = self._evaluated(datum, step, time, inputs)
         terms, codes, mean, cov = found
-        if len(codes) == 1 and codes[0] == NONE:
-            points.keep()
-            row = Row(float(terms[0]), mean[0], cov[0], 1.0)
-        else:
-            row = self._mixed(place, points, found)
+        if len(codes) > 1:
+            return self._mixed(datum, place, points, found)
+        if codes[0] != NONE:
+            raise _without_likelihood(place, codes)
+        points.keep()
         self._points = points
         self._steps.passed(place, datum)
-        return row
+        return Row(float(terms[0]), mean[0], cov[0], 1.0)
 
     def advance(
         self, *, step: int | None = None, time: float | None = None, inputs: Any = None
@@ -152,13 +152,7 @@ class OnlineFilter:
         missing = np.full(self._system.p, np.nan)
         place, points, found = self._evaluated(missing, step, time, inputs)
         prediction = self._predicted(place, found)
-        is_alive = found.codes == NONE
-        points.keep(None if is_alive.all() else is_alive)
-        self._theta, self._seeds = self._theta[is_alive], self._seeds[is_alive]
-        log_weights = self._log_weights[is_alive]
-        self._log_weights = log_weights - np.logaddexp.reduce(log_weights)
-        self._points = points
-        self._steps.passed(place, None)
+        self._stand(place, points, found.codes == NONE, self._log_weights, None)
         return prediction
 
     def _evaluated(
@@ -170,20 +164,33 @@ class OnlineFilter:
             points = self._points_from(points.left, place.is_on_grid)
         return place, points, points(place.step, datum, self._steps.rows(place, inputs))
 
-    def _mixed(self, place: Place, points: FilterSteps, found: Step) -> Row:
-        """The row of several draws, of which those that fail are left out from now on."""
+    def _mixed(self, datum: Array, place: Place, points: FilterSteps, found: Step) -> Row:
+        """The row of several draws."""
         terms, codes, mean, cov = found
         is_alive = codes == NONE
         if not is_alive.any():
-            raise _failed(f"the row at step {place.step} has no likelihood", codes)
-        points.keep(None if is_alive.all() else is_alive)
-        self._theta, self._seeds = self._theta[is_alive], self._seeds[is_alive]
-        log_weights = self._log_weights[is_alive] + terms[is_alive]
-        log_likelihood = float(np.logaddexp.reduce(log_weights))
-        self._log_weights = log_weights - log_likelihood
+            raise _without_likelihood(place, codes)
+        log_weights = self._log_weights + np.where(is_alive, terms, -np.inf)
+        log_likelihood = self._stand(place, points, is_alive, log_weights, datum)
         weights = np.exp(self._log_weights)
         moments = _mixture(weights, mean[is_alive], cov[is_alive])
         return Row(log_likelihood, *moments, float(1.0 / np.square(weights).sum()))
+
+    def _stand(
+        self,
+        place: Place,
+        points: FilterSteps,
+        is_alive: NDArray[np.bool_],
+        log_weights: Array,
+        datum: Array | None,
+    ) -> float:
+        """Stand at a place, of draws at those alone that have not failed; the log of their sum."""
+        points.keep(None if is_alive.all() else is_alive)
+        self._theta, self._seeds = self._theta[is_alive], self._seeds[is_alive]
+        total = float(np.logaddexp.reduce(log_weights[is_alive]))
+        self._log_weights, self._points = log_weights[is_alive] - total, points
+        self._steps.passed(place, datum)
+        return total
 
     def predict(
         self, *, step: int | None = None, time: float | None = None, inputs: Any = None
@@ -282,7 +289,9 @@ def online(
     >>> row.mean.shape, row.cov.shape
     ((2,), (2, 2))
     >>> later = psf.online(system, psf.EKF(), {"k": 2.0}, state=tracker.state)
-    >>> later.update(0.95, step=2) == tracker.update(0.95, step=2)  # doctest: +SKIP
+    >>> same = later.update(0.95, step=2), tracker.update(0.95, step=2)
+    >>> same[0].log_likelihood == same[1].log_likelihood
+    True
     """
     check_system_and_filter(system, filter)
     tell_of_choice(system, filter)
@@ -292,7 +301,7 @@ def online(
             "the package do"
         )
     theta = flat_parameters(system, params)
-    theta = theta.reshape(-1, theta.shape[-1])  # of all chains
+    theta = theta.reshape(math.prod(theta.shape[:-1]), theta.shape[-1])  # of all chains
     if not len(theta):
         raise ModelError("params must be numbers or draws, got arrays of length 0")
     identity = system.fingerprint, repr(filter), blake2b(theta.tobytes()).hexdigest()
@@ -318,6 +327,10 @@ def _mixture(weights: Array, mean: Array, cov: Array) -> tuple[Array, Array]:
     whole = weights @ mean
     apart = mean - whole
     return whole, np.einsum("m,mij->ij", weights, cov) + (apart.T * weights) @ apart
+
+
+def _without_likelihood(place: Place, codes: Array) -> ModelError:
+    return _failed(f"the row at step {place.step} has no likelihood", codes)
 
 
 def _failed(what: str, codes: Array) -> ModelError:

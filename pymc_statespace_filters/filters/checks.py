@@ -15,27 +15,21 @@ NO_DIGITS = 1e13
 
 
 @dataclass(frozen=True)
-class Refusal(Fact):
+class _OfFilter(Fact):
+    system: System
+    filter: Any
+
+
+class Refusal(_OfFilter):
     """A filter cannot treat a system; in words, which others can."""
 
-    system: System
-    filter: Any
 
-
-@dataclass(frozen=True)
-class Choice(Fact):
+class Choice(_OfFilter):
     """A filter linearises what jumps, repeats a run without noise, or has no digits."""
 
-    system: System
-    filter: Any
 
-
-@dataclass(frozen=True)
-class Bias(Fact):
+class Bias(_OfFilter):
     """A filter has a bias where none is allowed; in words, which others have none."""
-
-    system: System
-    filter: Any
 
 
 def takes(filter: Filter, system: System) -> bool:

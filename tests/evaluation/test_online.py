@@ -204,6 +204,17 @@ def test_an_advance_is_no_row(resets):
     assert_same(rows, run_of(system, psf.EKF(), {"a": 0.7}, [0.4, 0.9], tracker, **record))
 
 
+def test_a_system_without_parameters():
+    level = psf.StateSpaceModel(
+        transition=lambda x, q: [x[0] + q[0]], process_noise=[[1.0]],
+        observation=lambda x: [x[0]], observation_noise=[[2.0]],
+        initial_mean=[0.5], initial_cov=[[3.0]],
+    )  # fmt: skip
+    row = psf.online(level, psf.EKF(), {}).update(1.5, step=1)
+    np.testing.assert_allclose(row.mean, [0.5 + 4.0 / 6.0])
+    np.testing.assert_allclose(row.log_likelihood, -0.5 * (np.log(2 * np.pi * 6.0) + 1.0 / 6.0))
+
+
 def test_draws_of_chains_are_draws():
     draws = np.array([[0.2, 0.9], [1.4, 0.5]])
     whole, flat = (psf.online(ONE_STATE, psf.EKF(), {"a": a}) for a in (draws, draws.ravel()))
