@@ -154,6 +154,18 @@ def test_draws_are_a_mixture_whose_weights_follow_the_rows(filter):
     np.testing.assert_allclose(rows[-1].n_effective, 1 / np.sum(w**2), rtol=1e-10)
 
 
+def test_the_covariance_of_a_mixture_has_both_halves():
+    draws = np.array([1.0, 3.0])
+    tracker = psf.online(OSCILLATOR, psf.EKF(), {"k": draws})
+    row = [tracker.update(y, step=int(k)) for k, y in zip(STEPS, DATA, strict=True)][-1]
+    runs = [psf.run_filter(OSCILLATOR, psf.EKF(), {"k": k}, DATA, steps=STEPS) for k in draws]
+    totals = np.array([run["log_likelihood"].values.sum() for run in runs])
+    w = np.exp(totals - logsumexp(totals))
+    mean, cov = (np.array([run[name].values[-1] for run in runs]) for name in ("mean", "cov"))
+    second = np.einsum("m,mij->ij", w, cov + mean[:, :, None] * mean[:, None])
+    np.testing.assert_allclose(row.cov, second - np.outer(w @ mean, w @ mean), rtol=1e-9)
+
+
 def test_draws_that_fail_are_left_out():
     """A rate at which the state overflows at once."""
     explosive = psf.StateSpaceModel(

@@ -3,11 +3,14 @@
 import numpy as np
 import pymc as pm
 import pytensor
+import pytensor.tensor as pt
 import pytest
+from pytensor.graph.basic import Variable
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.pymc_model.inspection import exactness, health_outputs, noise_seeds
+from pymc_statespace_filters.system.equations import folded_constants
 from tests.systems import PAIR, PAIR_DATA, STEPS
 
 ENKF = psf.EnKF(20)
@@ -82,3 +85,12 @@ def test_health_comes_out_of_the_same_evaluation():
         assert record.shape == (3,)
         assert record[1] != 0
         assert record[2] == 1  # step 0 is met before any power of a
+
+
+def test_constants_are_known_whatever_they_are_made_of():
+    x, s = pt.vector("x", shape=(3,)), pt.scalar("s")
+    known = folded_constants([pt.roll(x, 1).shape[0], 0.0 * s, pt.stack([s - s, 1.0])])
+    assert known[0] == 3
+    assert known[1] == 0.0
+    np.testing.assert_array_equal(known[2], [0.0, 1.0])
+    assert isinstance(folded_constants([2.0 * s])[0], Variable)
