@@ -46,9 +46,7 @@ nb_execution_cache_path = str(notebook_cache.folder(HERE.parent))
 nb_execution_raise_on_error = False
 nb_execution_timeout = 240
 nb_merge_streams = True
-nb_output_stderr = (
-    "warn"  # a cell that is meant to show a warning sets output_stderr
-)
+nb_output_stderr = "show"  # and `report_stderr` warns, with the text
 os.environ["MATPLOTLIBRC"] = str(HERE / "_static" / "matplotlibrc")
 
 # The reference is the list of public names in __init__.py.
@@ -90,5 +88,6 @@ def setup(app: Sphinx) -> None:
     reference_pages.write(HERE / "reference" / "api")
     notebook_cache.prepare(Path(nb_execution_cache_path))
     app.connect("env-before-read-docs", page_order.spread_notebooks)
+    app.connect("doctree-read", notebook_cache.report_stderr)
     app.connect("build-finished", notebook_cache.report_failures)
     app.connect("build-finished", local_traces.report)

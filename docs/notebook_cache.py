@@ -10,6 +10,8 @@ import os
 import shutil
 from pathlib import Path
 
+import matplotlib.font_manager  # noqa: F401 - lists the fonts, once for all kernels: a slow list is a warning
+from docutils import nodes
 from jupyter_cache import get_cache
 from sphinx.application import Sphinx
 from sphinx.util import logging
@@ -56,6 +58,23 @@ def _set_up_kernels(profiles: Path) -> None:
         encoding="utf-8",
     )
     os.environ["IPYTHONDIR"] = str(profiles)
+
+
+def report_stderr(app: Sphinx, page: nodes.document) -> None:
+    """Warn of what a cell wrote to its stderr, unless its page says what to do with it."""
+    for cell in page.findall(
+        lambda node: "cell_metadata" in getattr(node, "attributes", ())
+    ):
+        if "output_stderr" in cell["cell_metadata"].get("mystnb", {}):
+            continue
+        for output in cell.findall(nodes.literal_block):
+            if "stderr" in output["classes"]:
+                logging.getLogger(__name__).warning(
+                    "cell %d wrote to its stderr: %s",
+                    cell["cell_index"],
+                    output.astext(),
+                    location=app.env.docname,
+                )
 
 
 def report_failures(app: Sphinx, exception: Exception | None) -> None:
