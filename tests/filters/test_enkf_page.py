@@ -16,7 +16,8 @@ from tests.filters.ensemble_contract import (
     log_gaussian,
     run,
 )
-from tests.systems import linear_system
+from tests.references.records import DOUBLE_WELL, double_well
+from tests.systems import DOUBLE_WELL_SYSTEM, double_well_parameters, linear_system, log_likelihoods
 
 
 class TestEnsembleLikelihood(EnsembleFilterContract):
@@ -79,6 +80,15 @@ def test_approaches_kalman(likelihood):
     # The bias is O(1/N), some 0.01; the mean of 60 errors has this standard error; 4 of them
     assert abs(errors.mean()) < 0.02 + 4 * errors.std() / np.sqrt(60)
     assert errors.std() < 0.2
+
+
+def test_bias_where_equations_bend_is_that_of_the_algorithm():
+    """Of filters written in NumPy for this record, with its standard error; 4 of these and ours."""
+    record, bias, bias_se = double_well(), -6.02, 0.09
+    exact = DOUBLE_WELL.point_mass_filter().run(*record).terms.sum()
+    arguments = EnKF(1000), double_well_parameters(DOUBLE_WELL), np.arange(100)
+    errors = log_likelihoods(DOUBLE_WELL_SYSTEM, *arguments, **record._asdict()) - exact
+    assert abs(errors.mean() - bias) < 4 * np.hypot(errors.std() / 10, bias_se)
 
 
 def test_carried_states_are_not_updated():

@@ -19,6 +19,8 @@ from tests.filters.ensemble_contract import (
     normals,
     run,
 )
+from tests.references.records import BROAD_DOUBLE_WELL, broad_double_well
+from tests.systems import DOUBLE_WELL_SYSTEM, double_well_parameters, log_likelihoods
 
 
 class TestPFEnKF(EnsembleFilterContract):
@@ -95,6 +97,18 @@ def test_approaches_kalman():
     errors = np.array([run(filter_, *LINE, seed=s)[0].sum() - exact for s in range(40)])
     # the kernel's smoothing leaves a bias of some hundredths; 4 standard errors of the mean
     assert abs(errors.mean()) < 0.05 + 4 * errors.std() / np.sqrt(40)
+    assert errors.std() < 0.3
+
+
+def test_approaches_the_truth_where_weights_repair_a_wrong_update():
+    """Never resampled, so that ten observations must carry them; the update is 1.5 nats off."""
+    steps, observed = (rows[:10] for rows in broad_double_well())
+    exact = BROAD_DOUBLE_WELL.point_mass_filter().run(steps, observed).terms.sum()
+    filter_ = PFEnKF(500, likelihood="weights", resample_below=0.0)
+    arguments = filter_, double_well_parameters(BROAD_DOUBLE_WELL), np.arange(12)
+    found = log_likelihoods(DOUBLE_WELL_SYSTEM, *arguments, observed=observed, steps=steps)
+    errors = found - exact
+    assert abs(errors.mean()) < 0.3 + 4 * errors.std() / np.sqrt(12)
     assert errors.std() < 0.3
 
 

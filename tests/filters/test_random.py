@@ -214,16 +214,6 @@ def test_normals_are_standard_normal_with_their_tails():
             assert abs(tail - expected) < 4 * np.sqrt(expected)
 
 
-def test_directions_of_a_pair_are_uniform_on_the_circle():
-    Z = normals(seed=5, members=64_000).reshape(-1, 2, 32)
-    angle = np.arctan2(Z[:, 1], Z[:, 0]).ravel()
-    radius = np.hypot(Z[:, 1], Z[:, 0]).ravel()
-    octants = np.histogram(angle, bins=8, range=(-np.pi, np.pi))[0]
-    assert stats.chisquare(octants).pvalue > 1e-3
-    assert stats.kstest(angle, "uniform", args=(-np.pi, 2 * np.pi)).pvalue > 1e-3
-    assert stats.kstest(radius, "rayleigh").pvalue > 1e-3
-
-
 def test_streams_are_uncorrelated():
     n = 12_800
     streams = [normals(seed=s, members=n) for s in (0, 1, -1, 2**40)]

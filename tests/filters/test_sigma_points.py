@@ -1,4 +1,7 @@
-"""UKF and IPLF: exact on linear systems, the textbook's elsewhere, and with exact gradients."""
+"""UKF and IPLF: exact on linear systems, the textbook's elsewhere.
+
+And exact gradients of all Gaussian filters.
+"""
 
 from dataclasses import dataclass
 from functools import cache
@@ -43,8 +46,8 @@ from tests.filters.test_truth_guided import CHAIN
 from tests.systems import DUFFING, linear_system
 
 RECORD = (STEPS, OBSERVED, FORCE, T0, 0)
-FILTERS = [psf.UKF(), psf.IPLF(n_iterations=2)]
-BOTH = pytest.mark.parametrize("filter", FILTERS, ids=lambda f: type(f).__name__)
+FILTERS = [psf.EKF(), psf.UKF(), psf.IPLF(n_iterations=2)]
+GAUSSIAN = pytest.mark.parametrize("filter", FILTERS, ids=lambda f: type(f).__name__)
 
 
 @dataclass(frozen=True)
@@ -104,7 +107,7 @@ def kalman(params):
     )
 
 
-@BOTH
+@GAUSSIAN
 @LINEAR
 def test_linear_systems_are_exact(filter, params):
     found = evaluate(filter, theta_of(params))
@@ -135,7 +138,7 @@ def states():
     return run
 
 
-@BOTH
+@pytest.mark.parametrize("filter", FILTERS[1:], ids=lambda f: type(f).__name__)
 @LINEAR
 @pytest.mark.parametrize("moment", ["filtered", "smoothed"])
 def test_states_of_a_linear_system_are_exact(states, filter, moment, params):
@@ -320,7 +323,7 @@ def test_the_scaling_is_that_of_wan_and_van_der_merwe():
     np.testing.assert_allclose(psf.log_likelihood(SQUARE, scaled, params, [d], steps=[0]), term)
 
 
-@BOTH
+@GAUSSIAN
 def test_a_batch_is_its_points(filter):
     points = theta_of(NONLINEAR) * np.random.default_rng(2).uniform(0.7, 1.3, size=(11, 7))
     terms, health = evaluator(LogLikelihood(SYSTEM, filter, POINTS))(points, *RECORD)
@@ -341,7 +344,7 @@ def differences(value, theta, step=4e-3):
     return NINTH_ORDER @ np.array(values) / h
 
 
-@BOTH
+@GAUSSIAN
 @pytest.mark.parametrize("params", [NONLINEAR, NONLINEAR | {"shake": 1e-2}])
 def test_the_gradient_is_that_of_the_likelihood(filter, params):
     found = evaluate(filter, theta_of(params)).gradient
@@ -349,7 +352,7 @@ def test_the_gradient_is_that_of_the_likelihood(filter, params):
     np.testing.assert_allclose(found, slopes, rtol=1e-8, atol=1e-9)
 
 
-@BOTH
+@GAUSSIAN
 @LINEAR
 def test_the_gradient_on_a_linear_system_is_that_of_the_kalman_filter(filter, params):
     """By those parameters that keep the system linear, and are not at their lower boundary."""
@@ -365,7 +368,7 @@ def test_the_gradient_on_a_linear_system_is_that_of_the_kalman_filter(filter, pa
     np.testing.assert_allclose(found[at], slopes, rtol=1e-9)
 
 
-@BOTH
+@GAUSSIAN
 def test_the_gradient_is_exact_with_a_known_start_and_noise_on_the_velocity(filter):
     """By all parameters but the variance of the start, which is at its lower boundary."""
     observed = np.array([[0.4, np.nan], [0.7, np.nan], [0.1, -0.2]])
@@ -403,7 +406,7 @@ def test_linear_equations_take_their_tangent():
     np.testing.assert_allclose(terms, regressed, rtol=1e-13)
 
 
-@BOTH
+@GAUSSIAN
 def test_impossible_settings_and_systems_are_refused(filter):
     name = type(filter).__name__
     memory = psf.StateSpaceModel(

@@ -1,11 +1,10 @@
 """The references themselves: converged, and exact where an exact answer exists."""
 
 import numpy as np
-import pytensor.tensor as pt
 import pytest
 
 from pymc_statespace_filters.testing import kalman_log_likelihood
-from tests.references import records, scan_oracle
+from tests.references import records
 from tests.references.grid import PointMassFilter
 from tests.references.grid_states import GridStates
 from tests.references.linear_states import linear_states
@@ -117,29 +116,3 @@ def test_surprises_are_as_large_as_they_say():
     for j, n_deviations in records.SURPRISES.items():
         assert off[j] == pytest.approx(n_deviations, abs=1e-6)
     assert np.sort(np.abs(off))[-4] < 4.5  # no other observation is a surprise
-
-
-def test_scan_oracle_is_exact_for_a_linear_system():
-    system, (steps, observed) = records.OSCILLATOR, records.oscillator_with_gaps()
-    scale = pt.dscalar("scale")
-
-    def exact(scale):
-        A, Q, C, R, m0, P0 = system.kalman_arguments()
-        return kalman_log_likelihood(
-            A, scale * Q, C, R, m0, P0, steps=steps, observed=observed
-        ).sum()
-
-    log_likelihood = scan_oracle.ekf_log_likelihood(
-        lambda x: pt.as_tensor(system.A) @ x,
-        lambda x: pt.as_tensor(system.C) @ x,
-        process_cov=scale * pt.as_tensor(system.B @ system.B.T),
-        observation_cov=pt.as_tensor(system.R),
-        initial_mean=pt.as_tensor(system.mean),
-        initial_cov=pt.as_tensor(system.cov),
-        steps=steps,
-        observed=observed,
-    )
-    value, gradient = scan_oracle.value_and_gradient(log_likelihood, {scale: 0.8})
-    assert value == pytest.approx(exact(0.8), rel=1e-11)
-    slope = (exact(0.8 + 1e-4) - exact(0.8 - 1e-4)) / 2e-4
-    assert gradient == pytest.approx([slope], rel=1e-6)
