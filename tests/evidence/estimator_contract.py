@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pymc_statespace_filters.errors import DataMismatchError
 from tests.evidence.analytic import gaussian, half_normal
 from tests.evidence.calibration import check_scores
 from tests.evidence.targets import Regression
@@ -13,9 +14,10 @@ LOG_EVIDENCE = -3.7  # of `gaussian`
 
 
 class EstimatorContract:
-    """Inherit and give ``estimator``, and the names of the estimators in ``id``s of tests."""
+    """Inherit and give ``estimator``."""
 
-    most = 0.06  # four standard errors are less: what is forgotten or counted twice is more
+    most = 0.06  # four standard errors are less; what is forgotten or counted twice is more
+    of_few = None  # the same with few proposals, for the test that has many runs
     reads_estimates = True  # those of the likelihood that are stored beside the draws
 
     def check(self, posterior, truth, rng):
@@ -60,7 +62,7 @@ class EstimatorContract:
         for run in range(50):
             rng = np.random.default_rng([35, run])
             posterior = gaussian(2, (4, 250), rng, correlation=0.8, noise_sd=1.0)
-            found = self.estimator.estimate(posterior, rng=rng)
+            found = (self.of_few or self.estimator).estimate(posterior, rng=rng)
             scores.append((found.log_evidence - LOG_EVIDENCE) / found.se)
         check_scores(scores)
 
@@ -77,3 +79,10 @@ class EstimatorContract:
             )
             found.append(self.estimator.estimate(posterior, rng=rng).log_evidence)
         assert found[1] == pytest.approx(found[0], abs=1e-6)
+
+    def test_no_density_where_the_draws_are(self):
+        rng = np.random.default_rng(33)
+        posterior = gaussian(2, (2, 500), rng)
+        nowhere = replace(posterior, evaluate=lambda x, rng: np.full(len(x), -np.inf))
+        with pytest.raises(DataMismatchError, match="another model"):
+            self.estimator.estimate(nowhere, rng=rng)

@@ -5,30 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pymc_statespace_filters.errors import DataMismatchError
 from pymc_statespace_filters.evidence.estimators.importance import Importance
 from pymc_statespace_filters.statistics.importance import pareto_k
-from tests.evidence.analytic import gaussian, half_normal
-from tests.evidence.calibration import EACH_NUMBER_OF_RUNS, check_scores
+from tests.evidence.analytic import gaussian
+from tests.evidence.estimator_contract import EstimatorContract
 from tests.evidence.hard_targets import Funnel
 from tests.evidence.targets import Banana, Regression, TwoModes, bounded, half_normally_distributed
 
 LOG_EVIDENCE = -3.7  # of `gaussian`
 
 
-@pytest.mark.parametrize("k", [1, 2, 4, 12])
-def test_evidence_of_a_normal_posterior(k):
-    rng = np.random.default_rng([50, k])
-    found = Importance().estimate(gaussian(k, (4, 2500), rng, correlation=0.5), rng=rng)
-    assert abs(found.log_evidence - LOG_EVIDENCE) < 4 * found.se < 0.04
-    assert not found.doubts
-
-
-def test_evidence_of_a_conjugate_regression():
-    rng = np.random.default_rng(51)
-    regression = Regression(20, 50, rng)
-    found = Importance().estimate(regression.posterior((4, 2500), rng), rng=rng)
-    assert abs(found.log_evidence - regression.log_evidence) < 4 * found.se < 0.05
+class TestImportance(EstimatorContract):
+    estimator = Importance()
+    reads_estimates = False
 
 
 @pytest.mark.parametrize(
@@ -39,34 +28,6 @@ def test_posteriors_unlike_a_normal_law(make):
     found = Importance().estimate(target.posterior((4, 2500), rng, correlation=0.8), rng=rng)
     assert abs(found.log_evidence - target.log_evidence) < 4 * found.se < 0.06
     assert not found.doubts
-
-
-def test_proposals_without_density_count_as_zeros():
-    rng = np.random.default_rng(53)
-    found = Importance().estimate(half_normal((4, 2500), rng), rng=rng)
-    assert abs(found.log_evidence - 0.5 * np.log(np.pi / 2)) < 4 * found.se < 0.02
-    assert found.settings["zero_density"] > 0.01
-
-
-@EACH_NUMBER_OF_RUNS
-@pytest.mark.parametrize(
-    ("make", "n_draws", "correlation", "noise_sd"),
-    [
-        (lambda: TwoModes(1), 100, 0.0, 1.0),
-        pytest.param(lambda: TwoModes(2), 500, 0.8, 0.0, marks=pytest.mark.slow),
-        pytest.param(lambda: Regression(4, 20, np.random.default_rng(0)), 500, 0.9, 1.0,
-                     marks=pytest.mark.slow),
-        pytest.param(lambda: Banana(4), 500, 0.0, 0.0, marks=pytest.mark.slow),
-    ],
-)  # fmt: skip
-def test_standard_errors_are_calibrated(make, n_draws, correlation, noise_sd, n_runs):
-    target, scores = make(), []
-    for run in range(n_runs):
-        rng = np.random.default_rng([54, run])
-        posterior = target.posterior((4, n_draws), rng, correlation=correlation, noise_sd=noise_sd)
-        found = Importance().estimate(posterior, rng=rng)
-        scores.append((found.log_evidence - target.log_evidence) / found.se)
-    check_scores(scores)
 
 
 def test_a_noisy_likelihood_gives_the_evidence_of_its_expectation():
@@ -126,15 +87,6 @@ def test_what_no_proposal_has_sampled_is_a_part_of_the_error():
     assert found.se > unsampled > 0.02
     assert any("has not been sampled" in doubt for doubt in found.doubts)
     assert abs(found.log_evidence - target.log_evidence) < 4 * found.se
-
-
-def test_no_density_where_the_draws_are():
-    rng = np.random.default_rng(61)
-    posterior = replace(
-        gaussian(2, (2, 500), rng), evaluate=lambda x, rng: np.full(len(x), -np.inf)
-    )
-    with pytest.raises(DataMismatchError, match="another model"):
-        Importance().estimate(posterior, rng=rng)
 
 
 def test_no_more_is_evaluated_where_few_terms_stay_few():
