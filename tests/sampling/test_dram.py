@@ -243,18 +243,6 @@ def test_a_chain_that_stands_still_says_so(caplog):
     assert caplog.text.count("accepted 0 of 100 proposals") == 2
 
 
-def test_data_changed_between_runs():
-    with pm.Model() as model:
-        data = pm.Data("data", [10.0])
-        mu = pm.Normal("mu", 0, 100)
-        pm.Normal("y", mu, 0.1, observed=data)
-        step = DRAM()
-        before = sample(step, draws=500)["posterior"]["mu"].mean()
-        pm.set_data({"data": [-10.0]}, model=model)
-        after = sample(step, draws=500)["posterior"]["mu"].mean()
-    np.testing.assert_allclose([before, after], [10.0, -10.0], atol=0.1)
-
-
 def test_a_mode_without_machine_code():
     with simple_model():
         slow = DRAM(compile_kwargs={"mode": "FAST_COMPILE"})

@@ -5,7 +5,6 @@ import numpy as np
 import pymc as pm
 import pytest
 
-from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.sampling import DRAM
 from pymc_statespace_filters.sampling.target.initial_points import N_COMPARED
 from tests.sampling.noisy_toy import Recorder, exact_posterior, noisy_model
@@ -107,24 +106,6 @@ def test_held_noise_is_the_models(toy):
     assert np.all(idata["sample_stats"]["d_seed"] == 20)
     assert np.all(again["sample_stats"]["d_seed"] == 21)
     assert max(map(abs, deviations(idata))) < 4.0
-
-
-def test_in_processes_the_seeds_are_the_same(toy):
-    with toy(noise_sd=1.3):
-        step = DRAM()
-        one, two = (sample(step, draws=100, cores=cores) for cores in (1, 2))
-    np.testing.assert_array_equal(one["sample_stats"]["d_seed"], two["sample_stats"]["d_seed"])
-    np.testing.assert_array_equal(one["posterior"]["mu"], two["posterior"]["mu"])
-
-
-def test_all_that_the_noise_depends_on_must_be_held(toy):
-    with toy(noise_sd=1.3) as model:
-        other = pm.Normal("other")
-        with pytest.raises(
-            ModelError, match=r"vars must include mu: the noisy likelihood of d depends"
-        ):
-            DRAM([other])
-        DRAM([model["mu"]])
 
 
 def test_another_variables_move_keeps_the_noise(toy):

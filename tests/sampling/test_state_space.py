@@ -2,7 +2,6 @@
 
 import os
 
-import arviz as az
 import numpy as np
 import pymc as pm
 import pytest
@@ -19,7 +18,6 @@ from pymc_statespace_filters.pymc_model.inspection import noise_seeds
 from pymc_statespace_filters.sampling import DRAM
 from pymc_statespace_filters.sampling.target.log_density import LogDensity
 from tests.sampling.test_dram import sample
-from tests.sampling.test_noise import Redrawing
 from tests.systems import autoregression, simulated
 
 STEPS = np.arange(1, 21)
@@ -38,53 +36,7 @@ def linear_model(filter):
     return model
 
 
-def exact_moments():
-    """Means and standard deviations by quadrature over the exact Kalman likelihood."""
-    phi, spread = np.linspace(-1.5, 2.0, 161), np.linspace(0.005, 4.0, 200)
-    grid = np.meshgrid(phi, spread, indexing="ij")
-    params = dict(zip(("phi", "spread"), grid, strict=True))
-    terms = psf.log_likelihood(LINEAR, psf.EKF(), params, DATA, steps=STEPS)
-    log_posterior = terms.sum(axis=-1) - 0.5 * ((grid[0] - 0.5) / 0.5) ** 2 - 0.5 * grid[1] ** 2
-    weight = np.exp(log_posterior - log_posterior.max())
-    weight /= weight.sum()
-    moments = {}
-    for name, values in params.items():
-        mean = np.sum(weight * values)
-        moments[name] = mean, np.sqrt(np.sum(weight * (values - mean) ** 2))
-    return moments
-
-
-def worst_deviations(idata):
-    """Largest error of a mean and of a standard deviation, in Monte Carlo standard errors."""
-    in_mean, in_sd = [], []
-    for name, (mean, sd) in exact_moments().items():
-        draws = idata["posterior"][name].to_numpy()
-        in_mean.append(abs(draws.mean() - mean) / az.mcse(draws, method="mean"))
-        in_sd.append(abs(draws.std() - sd) / az.mcse(draws, method="sd"))
-    return max(in_mean), max(in_sd)
-
-
 FEW = psf.BootstrapPF(20)
-
-
-@pytest.mark.filterwarnings("ignore::pymc_statespace_filters.errors.FilterWarning")
-def test_the_toy_is_as_noisy_as_claimed():
-    seeds = np.arange(2000)
-    terms = psf.log_likelihood(LINEAR, FEW, TRUTH, DATA, steps=STEPS, seed=seeds)
-    assert 1.5 < terms.sum(axis=-1).var() < 3.0
-
-
-def test_few_particles_exact_posterior():
-    """Four comparisons at 4 standard errors: one false alarm in 4000 seeds."""
-    with linear_model(FEW):
-        idata = sample(DRAM(stages=(2, 2)), draws=8000)
-    assert max(worst_deviations(idata)) < 4.0
-
-
-def test_the_same_test_finds_redrawn_estimates():
-    with linear_model(FEW):
-        idata = sample(Redrawing(stages=(2, 2)), draws=8000)
-    assert max(worst_deviations(idata)) > 6.0
 
 
 def test_the_filter_runs_once_in_an_evaluation():
@@ -92,20 +44,6 @@ def test_the_filter_runs_once_in_an_evaluation():
         step = DRAM()
     nodes = step._target.density._function.maker.fgraph.apply_nodes
     assert sum(isinstance(node.op, LogLikelihood) for node in nodes) == 1
-
-
-def test_the_seed_of_a_draw_reproduces_its_estimate():
-    with linear_model(FEW) as model:
-        held = model["d_seed"].get_value()
-        idata = sample(DRAM(), draws=100, tune=200)
-        assert model["d_seed"].get_value() == held
-        logp = model.compile_logp()
-        stats, posterior = idata["sample_stats"], idata["posterior"]
-        for draw in range(0, 100, 20):
-            model["d_seed"].set_value(stats["d_seed"][1, draw].to_numpy())
-            at = posterior.isel(chain=1, draw=draw)
-            point = {"phi": at["phi"].to_numpy(), "spread_log__": np.log(at["spread"].to_numpy())}
-            np.testing.assert_allclose(logp(point), stats["lp"][1, draw], rtol=1e-10)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
