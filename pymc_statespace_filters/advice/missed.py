@@ -69,19 +69,16 @@ def _missed_parts(fact: EndedRun) -> list[str]:
     if not (is_enough or with_both_signs(model, flat)):
         return []
     density = ModelDensity(model, moved=noise_was_moved(tree))
-
-    def evaluate(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        size = len(x), len(density.seed_names)
-        return density.evaluate(x, rng.integers(np.iinfo(np.int64).max, size=size))
-
     found: list[str] = []
     if is_enough:
         log_density = stats["lp"].transpose("chain", "draw").values.astype(np.float64)
         seconds = max(_LEAST_SECONDS, _SHARE * fact.seconds)
         wide = prior.draws if prior.is_prior and len(prior.draws) > 1 else None
-        found = unvisited(model, draws, log_density, evaluate, seconds, fact.rngs[0], wide)
+        found = unvisited(
+            model, draws, log_density, density.evaluate_afresh, seconds, fact.rngs[0], wide
+        )
         store(tree, found)
     if not density.seed_names:
-        sign = signs_message(model, flat, lambda x: evaluate(x, fact.rngs[0]))
+        sign = signs_message(model, flat, lambda x: density.evaluate_afresh(x, fact.rngs[0]))
         found = found if sign is None else [sign, *found]
     return [f"{text[0].upper()}{text[1:]}." for text in found]

@@ -66,20 +66,8 @@ def chib_jeliazkov(
         Number of blocks of neighbouring parameters whose posterior ordinates are estimated in
         turn. The default is one block; with ten parameters or more, and a predicted error above
         0.1 nats for one block, it is blocks of about ten.
-    exchangeable : str or list, optional
-        As for `estimate_evidence`.
-    random_seed : int or numpy.random.Generator, optional
-        Seed of the proposals and of the noise of their likelihoods.
-    extend_inferencedata : bool
-        Whether to store the result in the group ``evidence`` of `idata`.
-    progressbar : bool
-        Whether to show a progress bar if the evaluations take more than two seconds.
-    cores : int, optional
-        Number of threads, on which no number depends; by default one for each core that the process
-        may use.
-    comm : mpi4py.MPI.Comm, "world" or mapping, optional
-        Ranks among which the points are divided, as in `sample_dram`; the result does not depend
-        on their number. A rank whose ``idata`` is None gets that of the first.
+    exchangeable, random_seed, extend_inferencedata, progressbar, cores, comm
+        As of `estimate_evidence`.
 
     Returns
     -------

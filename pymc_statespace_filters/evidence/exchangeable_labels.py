@@ -27,6 +27,7 @@ from pytensor.tensor.random.type import RandomType
 
 from ..errors import ModelError
 from ..pymc_model.density import ModelDensity
+from ..pymc_model.elements import places_in_vector
 from ..pymc_model.posterior_draws import unconstrained
 from ..pymc_model.prior import is_restricted
 from .labels import Array, Key, Labels, are_symmetric, placements
@@ -93,11 +94,8 @@ class OneOrder:
         """The posterior with a density of zero in other orders."""
         if self.ordered:
             return posterior
-        start, first, numbers = self._model.initial_point(), 0, {}
-        for rv in self._model.free_RVs:
-            like = start[self._model.rvs_to_values[rv].name]
-            numbers[rv.name] = first + np.arange(like.size).reshape(1, *like.shape)
-            first += like.size
+        places: dict[str, Any] = places_in_vector(self._model)
+        numbers = {name: at[None] for name, at in places.items()}
         [columns] = self.labels.of_labels(self._key, numbers)
 
         def evaluate(x: Array, rng: np.random.Generator) -> Array:

@@ -135,7 +135,7 @@ def are_symmetric(
     else:
         evaluate, x = density.evaluate, unconstrained(density.model, joined)
     at, inside = np.full(len(x), np.nan), np.isfinite(x).all(axis=1)
-    seeds = rng.integers(np.iinfo(np.int64).max, size=(len(x), len(density.seed_names)))
+    seeds = density.fresh_seeds(len(x), rng)
     at[inside] = evaluate(x[inside], seeds[inside])
     before, after = np.split(at.reshape(-1, n_seeds, N_POINTS), [1])
     with np.errstate(invalid="ignore"):  # of infinities, which tell nothing

@@ -66,8 +66,7 @@ def build_posterior(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterio
     def evaluate(x: Array, rng: np.random.Generator) -> Array:
         if held:
             return density.evaluate(x, np.broadcast_to(seeds[0, 0], (len(x), seeds.shape[-1])))
-        size = (len(x), seeds.shape[-1])
-        return density.evaluate(x, rng.integers(np.iinfo(np.int64).max, size=size))
+        return density.evaluate_afresh(x, rng)
 
     prior = ModelPrior(density.model)
     facts = not held, prior, populations_of(idata)

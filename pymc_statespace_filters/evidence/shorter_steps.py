@@ -163,10 +163,9 @@ def _log_densities(
 ) -> list[Array]:
     """Log-densities (chain, draw, seed) at the draws by each of the graphs, with the same seeds."""
     functions = [RowFunction(model, graph) for graph in graphs]
-    seed_names = functions[0].seed_names
-    n_seeds = N_SEEDS if seed_names else 1
+    n_seeds = N_SEEDS if functions[0].seed_names else 1
     x = np.repeat(draws.reshape(-1, draws.shape[-1]), n_seeds, axis=0)
-    seeds = rng.integers(np.iinfo(np.int64).max, size=(len(x), len(seed_names)))
+    seeds = functions[0].fresh_seeds(len(x), rng)
     found = []
     for halvings, function in enumerate(functions):
         with row_progress(function.calls, enabled=progressbar) as announce:

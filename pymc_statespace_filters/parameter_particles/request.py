@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..errors import ModelError
 from ..filters.outcomes import why_zero
 from ..pymc_model.density import check_free_variables
+from ..pymc_model.elements import places_in_vector
 from ..pymc_model.filter_estimates import failures_at
 from ..pymc_model.fingerprint import FINGERPRINT_DIGITS, model_data_fingerprint, model_fingerprint
 from ..pymc_model.posterior_draws import BY_PARTICLES
@@ -100,8 +101,7 @@ def checked_request(
 ) -> Request:
     """Check the arguments against the model."""
     check_free_variables(model)
-    start = model.initial_point()
-    k = sum(start[model.rvs_to_values[rv].name].size for rv in model.free_RVs)
+    k = sum(at.size for at in places_in_vector(model).values())
     check_count("draws", draws, 1)
     if draws < 2 * k:
         raise ModelError(

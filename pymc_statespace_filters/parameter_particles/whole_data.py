@@ -45,7 +45,7 @@ class WholeLikelihood:
 
     def evaluate(self, x: Array, rng: np.random.Generator) -> Particles:
         """Particles at points, a noisy likelihood estimated with fresh noise at each of them."""
-        seeds = self.factors.seeds(len(x), rng)
+        seeds = self.factors.likelihood.fresh_seeds(len(x), rng)
         log_prior, log_likelihood = self.factors.evaluate_with(x, seeds)
         none = np.empty((len(x), 0))
         return Particles(x, log_prior, np.zeros(len(x)), log_likelihood, seeds, none)

@@ -150,6 +150,14 @@ class RowFunction:
         values = self.calls(x, *seeds.T)[0]
         return np.where(np.isnan(values), -np.inf, values)
 
+    def fresh_seeds(self, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Seeds of independent noise, a row for each of so many points."""
+        return rng.integers(np.iinfo(np.int64).max, size=(count, len(self.seed_names)))
+
+    def evaluate_afresh(self, x: Array, rng: np.random.Generator) -> Array:
+        """As `evaluate`, with fresh noise at every point."""
+        return self.evaluate(x, self.fresh_seeds(len(x), rng))
+
 
 class ModelDensity(RowFunction):
     """The compiled log-density of a model.

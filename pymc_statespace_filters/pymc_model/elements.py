@@ -4,6 +4,7 @@ An element of a vector is named by its position, ``"k[2]"``, or by the coordinat
 dimensions, ``"k[z^3]"``, as ArviZ labels it. The vector itself names all of them.
 """
 
+import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pymc as pm
+from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
@@ -41,20 +43,18 @@ class Elements:
     @classmethod
     def of(cls, model: pm.Model) -> "Elements":
         """Those of a model."""
-        start = model.initial_point()
         labels: list[str] = []
         variables: list[str] = []
         meanings: dict[str, set[Columns]] = defaultdict(set)
-        for rv in model.free_RVs:
-            shape = start[model.rvs_to_values[rv].name].shape
-            own, positions = labels_of(rv.name, shape, model), _positions(rv.name, shape)
-            columns = range(len(labels), len(labels) + len(own))
-            meanings[rv.name].add(tuple(columns))
+        for variable, at in places_in_vector(model).items():
+            own, positions = labels_of(variable, at.shape, model), _positions(variable, at.shape)
+            columns = at.ravel().tolist()
+            meanings[variable].add(tuple(columns))
             for column, *names in zip(columns, own, positions, strict=True):
                 for name in names:
                     meanings[name].add((column,))
             labels += own
-            variables += [rv.name] * len(own)
+            variables += [variable] * len(own)
         frozen = {name: frozenset(found) for name, found in meanings.items()}
         return cls(tuple(labels), tuple(variables), frozen)
 
@@ -81,6 +81,17 @@ class Elements:
             f"{argument} must name free variables of the model, or elements of them, got {name!r}: "
             f"{what}"
         )
+
+
+def places_in_vector(model: pm.Model) -> dict[str, NDArray[np.int64]]:
+    """For every free variable the columns of its scalars, in the shape of its value."""
+    start, first, places = model.initial_point(), 0, {}
+    for rv in model.free_RVs:
+        shape = np.shape(start[model.rvs_to_values[rv].name])
+        size = math.prod(shape)
+        places[rv.name] = np.arange(first, first + size).reshape(shape)
+        first += size
+    return places
 
 
 def element_names(model: pm.Model, values: Sequence[TensorVariable] | None = None) -> list[str]:

@@ -24,6 +24,7 @@ from ..ops.states import GoingOn, ResumableRun
 from ..parallel.shared_rows import evaluated_rows
 from ..parallel.threads import Pieces
 from ..system.model import StateSpaceModel
+from .elements import places_in_vector
 
 _PIECE_SECONDS = 0.02  # of one call of machine code, for whose end an interrupt waits
 _AT_ONCE = 8  # points, at least, of one call
@@ -53,9 +54,7 @@ class ParametersAtPoints:
 
     def __init__(self, model: pm.Model, theta: Variable) -> None:
         values = [model.rvs_to_values[rv] for rv in model.free_RVs]
-        start = model.initial_point()
-        self._shapes = [np.shape(start[value.name]) for value in values]
-        self._ends = np.cumsum([int(np.prod(shape)) for shape in self._shapes])[:-1]
+        self._places = places_in_vector(model).values()
         (graph,) = model.replace_rvs_by_values([theta])
         points, (theta_at,) = at_points(values, [graph])
         # Machine code would take seconds to compile; NumPy takes all points in one call.
@@ -65,10 +64,7 @@ class ParametersAtPoints:
 
     def __call__(self, x: Array) -> Array:
         """Parameters (m, n_theta) at points (m, k)."""
-        parts = np.split(x, self._ends, axis=1)
-        points = [
-            part.reshape(len(x), *shape) for part, shape in zip(parts, self._shapes, strict=True)
-        ]
+        points = [x[:, at] for at in self._places]
         return np.ascontiguousarray(self._function(*points), dtype=np.float64)
 
 

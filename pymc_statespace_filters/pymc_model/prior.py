@@ -1,6 +1,6 @@
 """The prior of a model on its unconstrained space: support, log-density, draws; likelihood."""
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,6 +18,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from ..errors import GradientUnavailableError, ModelError
 from .density import RowFunction, check_free_variables
+from .elements import places_in_vector
 from .prior_draws import PriorDraws
 
 _IMPROPER = (FlatRV, HalfFlatRV, ICARRV)  # PyMC's densities without a finite integral
@@ -126,14 +127,10 @@ def _widths(rv: TensorVariable, model: pm.Model) -> Iterator[float]:
 
 
 class ModelPrior:
-    """The distribution of a model's free variables; Potentials belong to the likelihood.
+    """The distribution of a model's free variables; Potentials belong to the likelihood."""
 
-    With ``variables``, that of some of them.
-    """
-
-    def __init__(self, model: pm.Model, variables: Sequence[TensorVariable] | None = None) -> None:
-        self._model = model
-        self._free = model.free_RVs if variables is None else list(variables)
+    def __init__(self, model: pm.Model) -> None:
+        self._model, self._free = model, model.free_RVs
 
     def log_density(self, x: Array) -> Array:
         """Log-density of points x (m, k), Jacobians included; NaN becomes -inf."""
@@ -176,9 +173,8 @@ class ModelPrior:
 
     def _check_no_atoms(self, draws: Array) -> None:
         """Raise if a variable takes single values with positive probability, as a clipped one."""
-        model, start = self._model, self._model.initial_point()
-        sizes = [start[model.rvs_to_values[rv].name].size for rv in self._free]
-        names = np.repeat([rv.name for rv in self._free], sizes)
+        places = places_in_vector(self._model)
+        names = np.repeat(list(places), [at.size for at in places.values()])
         for name, column in zip(names, draws.T, strict=True):
             repeated = len(column) - len(np.unique(column))
             if repeated > _MAX_REPEATED * len(column):
@@ -228,7 +224,7 @@ class ModelFactors:
 
         A noisy likelihood is estimated with fresh noise at every point.
         """
-        return self.evaluate_with(x, self.seeds(len(x), rng))
+        return self.evaluate_with(x, self.likelihood.fresh_seeds(len(x), rng))
 
     def with_slopes(self) -> Callable[[Array], tuple[Array, Array]] | None:
         """A function that gives log-likelihoods (m,) and gradients (m, k) at points (m, k).
@@ -248,11 +244,6 @@ class ModelFactors:
             return np.where(inside, log_likelihood, -np.inf), slopes
 
         return found
-
-    def seeds(self, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-        """Fresh seeds of the noise, a row for each point."""
-        size = count, len(self.likelihood.seed_names)
-        return rng.integers(np.iinfo(np.int64).max, size=size)
 
     def evaluate_with(self, x: Array, seeds: NDArray[np.int64]) -> tuple[Array, Array]:
         """The same with the noise of these seeds, a row for each point."""

@@ -20,6 +20,7 @@ from ..ops.base import evaluator
 from ..ops.likelihood import LogLikelihood
 from ..system.panel_records import FIRST_INPUT, N_COLUMNS, RECORD, STEP, records_of
 from .density import RowFunction, check_free_variables
+from .elements import places_in_vector
 from .inspection import scored_rows, state_space_nodes
 from .random_variable import draw_in_python
 
@@ -83,8 +84,7 @@ class ScoredVariable:
         self.observed = np.asarray(observed.eval(mode="FAST_COMPILE"), dtype=np.float64)
         self._evaluate = evaluator(LogLikelihood(self.system, self.filter, PANEL))
         self._theta = interpreted_at_points(self._values, theta)
-        point = model.initial_point()
-        self._shapes = [point[value.name].shape for value in self._values]
+        self._places = places_in_vector(model).values()
         others = [v for v in [*model.basic_RVs, *model.potentials] if v.name != name]
         self._others = RowFunction(model, model.logp(vars=others))
 
@@ -120,10 +120,7 @@ class ScoredVariable:
 
     def theta(self, x: Array) -> Array:
         """The parameters (m, G, k) of every record at points x (m, k_x)."""
-        sizes = [int(np.prod(shape)) for shape in self._shapes]
-        columns = np.split(x, np.cumsum(sizes)[:-1], axis=1)
-        parts = [c.reshape(len(x), *shape) for c, shape in zip(columns, self._shapes, strict=True)]
-        found = self._theta(*parts)
+        found = self._theta(*(x[:, at] for at in self._places))
         return found if self.is_panel else found[:, None]
 
     def other_density(self, x: Array) -> Array:

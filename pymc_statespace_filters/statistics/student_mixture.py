@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp
 
 DEGREES_OF_FREEDOM = 5.0
-NORMAL = 1e8  # degrees of freedom with which a component is a normal distribution
 N_STEPS, MIN_STEP = 200, 1e-3  # EM iterations; smallest gain in nats per draw
 ROUNDING = 1e-10  # of the largest eigenvalue, the least one of a conditional scale matrix
 WIDE_WEIGHT, WIDE_SCALE = 0.1, 1.5  # of the defensive component; scale in those of the draws
@@ -32,7 +31,6 @@ class StudentMixture:
     weights: Array  # (J,)
     means: Array  # (J, k)
     chols: Array  # (J, k, k), lower factors of the scale matrices
-    degrees: float = DEGREES_OF_FREEDOM
 
     def log_density(self, x: Array) -> Array:
         """Log-density at points x (m, k), shape (m,)."""
@@ -40,7 +38,7 @@ class StudentMixture:
 
     def log_joint(self, x: Array) -> Array:
         """Log-density of each component times its weight at x (m, k), shape (J, m)."""
-        nu, k = self.degrees, x.shape[-1]
+        nu, k = DEGREES_OF_FREEDOM, x.shape[-1]
         log_det = np.log(np.diagonal(self.chols, axis1=1, axis2=2)).sum(axis=1)
         constant = gammaln((nu + k) / 2) - gammaln(nu / 2) - 0.5 * k * math.log(nu * math.pi)
         tail = 0.5 * (nu + k) * np.log1p(self.squared_distances(x) / nu)
@@ -55,19 +53,15 @@ class StudentMixture:
         """Draw independent points, shape (count, k)."""
         component = rng.choice(len(self.weights), size=count, p=self.weights)
         normals = rng.standard_normal((count, self.means.shape[-1]))
-        spread = np.sqrt(self.degrees / rng.chisquare(self.degrees, count))
+        spread = np.sqrt(DEGREES_OF_FREEDOM / rng.chisquare(DEGREES_OF_FREEDOM, count))
         moves = np.einsum("mij,mj->mi", self.chols[component], normals)
         return self.means[component] + spread[:, None] * moves
 
     def with_defensive_component(self) -> "StudentMixture":
         """Add a component wider than the standardised draws."""
         k = self.means.shape[-1]
-        return replace(
-            self,
-            weights=np.append((1 - WIDE_WEIGHT) * self.weights, WIDE_WEIGHT),
-            means=np.concatenate([self.means, np.zeros((1, k))]),
-            chols=np.concatenate([self.chols, WIDE_SCALE * np.eye(k)[None]]),
-        )
+        wide = StudentMixture(np.ones(1), np.zeros((1, k)), WIDE_SCALE * np.eye(k)[None])
+        return self.mixed_with(wide, WIDE_WEIGHT)
 
     def widened(self, scale: float) -> "StudentMixture":
         """The same with wider components."""
@@ -175,7 +169,6 @@ def likeliest_mixture(
     rng: np.random.Generator,
     *,
     least_gain: float = 0.0,
-    degrees: float = DEGREES_OF_FREEDOM,
 ) -> StudentMixture:
     """The fit to standardised draws that makes other draws most probable.
 
@@ -184,13 +177,20 @@ def likeliest_mixture(
     """
     best, highest = place_components(first, 1, rng), -np.inf
     for n_components in numbers:
-        placed = place_components(first, n_components, rng)
-        fitted = fit_mixture(first, replace(placed, degrees=degrees))
+        fitted = fit_mixture(first, place_components(first, n_components, rng))
         held_out = float(fitted.log_density(second).mean())
         if held_out <= highest + least_gain:
             break
         best, highest = fitted, held_out
     return best
+
+
+def mixture_of(x: Array, n_components: int, rng: np.random.Generator) -> StudentMixture | None:
+    """So many components, fitted to draws (n, k); None if these do not vary in every direction."""
+    if (draws := standardised(x)) is None:
+        return None
+    fitted = fit_mixture(draws.z, place_components(draws.z, n_components, rng))
+    return fitted.affine(draws.mean, draws.chol)
 
 
 def fit_mixture(x: Array, mixture: StudentMixture) -> StudentMixture:
@@ -215,7 +215,7 @@ def _log_sum(log_joint: Array) -> Array:
 
 def _m_step(mixture: StudentMixture, x: Array, responsibilities: Array) -> StudentMixture:
     """Maximisation step of EM, given the responsibilities (J, n) of the components."""
-    nu, k = mixture.degrees, x.shape[-1]
+    nu, k = DEGREES_OF_FREEDOM, x.shape[-1]
     # Draws in the tail of a component get little weight.
     weighted = responsibilities * (nu + k) / (nu + mixture.squared_distances(x))
     sizes = responsibilities.sum(axis=1)

@@ -84,11 +84,6 @@ class SubmodelDensity:
         """As of `SwitchedDensity`."""
         return self.density.blocks
 
-    def fresh_seeds(self, count: int, rng: np.random.Generator) -> Seeds:
-        """Seeds of independent noise for so many points."""
-        size = (count, len(self.density.seed_names))
-        return rng.integers(np.iinfo(np.int64).max, size=size)
-
     def columns_of(self, present: Sets) -> Columns:
         """The columns that a sub-model has: all but those of absent terms."""
         return np.flatnonzero(np.append(present, True)[self.candidate_of])

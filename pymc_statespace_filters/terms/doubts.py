@@ -48,7 +48,7 @@ def check_distinct(density: SubmodelDensity, draws: Array, rng: np.random.Genera
     """
     n = len(density.candidates)
     x = draws[rng.integers(len(draws), size=N_COMPARED)]
-    seeds = density.fresh_seeds(N_COMPARED, rng)
+    seeds = density.density.fresh_seeds(N_COMPARED, rng)
     sets = np.concatenate([np.ones((1, n), dtype=bool), ~np.eye(n, dtype=bool)])
     found = density.evaluate(
         Point(

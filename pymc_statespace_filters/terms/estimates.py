@@ -190,7 +190,7 @@ class Sampler:
         ]
         x = np.concatenate([points for points, _ in drawn])
         present = np.repeat([one.present for one in proposals], counts, axis=0)
-        seeds = self._density.fresh_seeds(len(x), self._rng)
+        seeds = self._density.density.fresh_seeds(len(x), self._rng)
         log_q = np.concatenate([log_q for _, log_q in drawn])
         log_weights = self._density.evaluate(Point(x, present, seeds)).total - log_q
         ends = np.cumsum(counts)[:-1]

@@ -19,6 +19,7 @@ import xarray as xr
 
 from ..errors import ModelError
 from ..evidence.estimators.student_mixture import flattened_copy
+from ..pymc_model.elements import places_in_vector
 from ..pymc_model.posterior_draws import unconstrained_draws
 from ..statistics.student_mixture import (
     StudentMixture,
@@ -199,12 +200,11 @@ def _in_columns(values: Mapping[str, np.ndarray], model: pm.Model) -> Array:
 
     NaN for those whose transform changes shape.
     """
-    start, parts = model.initial_point(), []
-    for rv in model.free_RVs:
-        size = start[model.rvs_to_values[rv].name].size
-        flat = values[rv.name].reshape(len(values[rv.name]), -1)
-        same = flat.shape[1] == size
-        parts.append(flat if same else np.full((len(flat), size), np.nan))
+    parts = []
+    for name, at in places_in_vector(model).items():
+        flat = values[name].reshape(len(values[name]), -1)
+        same = flat.shape[1] == at.size
+        parts.append(flat if same else np.full((len(flat), at.size), np.nan))
     return np.concatenate(parts, axis=1, dtype=np.float64)
 
 

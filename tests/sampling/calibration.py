@@ -261,10 +261,10 @@ class Redrawing(ChainTask):
     """The common mistake: the likelihood of the current point is estimated anew for every move."""
 
     def _advance(self):
-        if self.n_done < self._tune:
+        if self.n_done < self.tune:
             return super()._advance()
         chain, done = self.chain, self.n_done
-        chain.start([chain.state.position.copy()], (), self._rng)
+        chain.start([chain.state.position.copy()], (), self.rng)
         return chain.advance(False, done, done, 1)
 
 

@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ...pymc_model.density import ConstrainedValues
-from ...pymc_model.elements import element_names
+from ...pymc_model.elements import element_names, places_in_vector
 from . import ALL_MODES
 from .check import MissedTail, missed_tails
 from .copies import missed_copy
@@ -54,7 +54,7 @@ def unvisited(
         for one in missed_tails(draws, log_density, evaluate, n_evaluations, rng)
     ]
     if prior is not None:
-        shapes = [np.shape(value) for value in model.initial_point().values()]
+        shapes = [at.shape for at in places_in_vector(model).values()]
         copy = missed_copy(draws, log_density, prior, shapes, evaluate, n_evaluations, rng)
         if copy is not None:  # a tail that leads there is a part of the same
             return [_sentence_of_copy(model, copy)]

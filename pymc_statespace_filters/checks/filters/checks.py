@@ -1,8 +1,7 @@
 """The checks of all StateSpace variables of a model at draws of its posterior."""
 
 import json
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -57,17 +56,19 @@ def _needs_check(system: Any, filter: Filter) -> bool:
     return not filter.is_exact_for(compiled) or (filter.noisy and not compiled.is_linear)
 
 
-def _draws_of(idata: xr.DataTree, model: pm.Model) -> Array:
-    """Draws (n, k) on the unconstrained space, all or some hundred of each chain."""
-    posterior = posterior_group(idata)
+def _draws_of(draws: xr.DataTree | Array, model: pm.Model) -> Array:
+    """Draws (n, k) on the unconstrained space, of a result all or some hundred of each chain."""
+    if isinstance(draws, np.ndarray):
+        return draws
+    posterior = posterior_group(draws)
     every = max(1, posterior.sizes["draw"] // _MOST_DRAWS)
     thinned = xr.DataTree.from_dict({"posterior": posterior.isel(draw=slice(None, None, every))})
-    draws = unconstrained_draws(thinned, model)
-    return draws.reshape(-1, draws.shape[-1])
+    found = unconstrained_draws(thinned, model)
+    return found.reshape(-1, found.shape[-1])
 
 
 def check_model(
-    idata: xr.DataTree,
+    draws: xr.DataTree | Array,
     model: pm.Model,
     *,
     filter: Filter | None,
@@ -78,43 +79,9 @@ def check_model(
 ) -> pd.DataFrame:
     """Check the filters of all observed StateSpace variables, at draws of the posterior.
 
-    ``filter`` is checked in their place; None: their own. ``seconds`` of CPU time are for all
-    variables together.
+    They are those of a result, or draws (n, k) of the unconstrained space. ``filter`` is checked in
+    their place; None: their own. ``seconds`` of CPU time are for all variables together.
     """
-    find_draws = partial(_draws_of, idata, model)
-    return _check_at(find_draws, model, filter, n_points, seconds, rng, progressbar=progressbar)
-
-
-def check_at_end(
-    draws: xr.DataTree | Array,
-    model: pm.Model,
-    filter: Filter | None,
-    seconds: float,
-    rng: np.random.Generator,
-    n_points: int = N_POINTS,
-) -> dict[str, dict[str, str]]:
-    """The outcomes for all variables, at the end of a calculation that took so many CPU seconds.
-
-    At its result, or at draws (n, k) of the unconstrained space.
-    """
-    find_draws = (
-        partial(_draws_of, draws, model) if isinstance(draws, xr.DataTree) else lambda: draws
-    )
-    seconds = max(LEAST_SECONDS * n_points / N_POINTS, _SHARE * seconds)
-    return outcomes_of(_check_at(find_draws, model, filter, n_points, seconds, rng))
-
-
-def _check_at(
-    find_draws: Callable[[], Array],
-    model: pm.Model,
-    filter: Filter | None,
-    n_points: int,
-    seconds: float,
-    rng: np.random.Generator,
-    *,
-    progressbar: bool = False,
-) -> pd.DataFrame:
-    """As `check_model`, at draws (n, k) that are looked for if there is something to check."""
     nodes = state_space_nodes(model)
     chosen = {
         name: filter or node.op.filter
@@ -126,7 +93,7 @@ def _check_at(
     for name, one in chosen.items():
         check_system_and_filter(nodes[name].op.system, one)
     checked = {n for n, one in chosen.items() if _needs_check(nodes[n].op.system, one)}
-    draws = find_draws() if checked else np.empty((0, 0))
+    x = _draws_of(draws, model) if checked else np.empty((0, 0))
     rows = []
     for name, one in chosen.items():
         if name in checked:
@@ -134,11 +101,25 @@ def _check_at(
             with row_progress(budget, enabled=progressbar) as begin, np.errstate(invalid="ignore"):
                 begin(f"check of {short_form(one)} of {name}", n_points)
                 # Invalid is minus infinity minus itself: failures.
-                findings = _check_variable(model, name, one, draws, n_points, budget, rng)
+                findings = _check_variable(model, name, one, x, n_points, budget, rng)
         else:
             findings = [_plain_row(one)]
         rows += [{"variable": name, "filter": short_form(one)} | f._asdict() for f in findings]
     return pd.DataFrame(rows)
+
+
+def check_at_end(
+    draws: xr.DataTree | Array,
+    model: pm.Model,
+    filter: Filter | None,
+    seconds: float,
+    rng: np.random.Generator,
+    n_points: int = N_POINTS,
+) -> dict[str, dict[str, str]]:
+    """The outcomes for all variables, at the end of a calculation that took so many CPU seconds."""
+    seconds = max(LEAST_SECONDS * n_points / N_POINTS, _SHARE * seconds)
+    found = check_model(draws, model, filter=filter, n_points=n_points, seconds=seconds, rng=rng)
+    return outcomes_of(found)
 
 
 def _plain_row(filter: Filter) -> Finding:

@@ -32,6 +32,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from ...compiler.native.compilation import warning_filter
 from ...pymc_model.density import ModelDensity
+from ...pymc_model.elements import places_in_vector
 from ..posterior import Posterior
 from .conditional import ConditionalStrength, fit_conditional
 from .strengths import Strengths, StrengthsAtPoints
@@ -81,17 +82,14 @@ class ConstantModel:
             fit = fit_conditionals(self._strengths(x), x[:, self._others], self._is_bounded)
             strengths, others = self._strengths(at), at[:, self._others]
             others = fit.translated(strengths.sizes, others)
-            own = self._seeds(len(at), None if seeds is None else _flat(seeds[:, averaged]), rng)
+            if seeds is None:
+                own = self.density.fresh_seeds(len(at), rng)
+            else:
+                own = _flat(seeds[:, averaged])
             found = fit.log_density(strengths, others) + self.density.evaluate(others, own)
             found -= posterior.log_density[:, averaged].ravel()
             log_terms[:, averaged] = found.reshape(log_terms[:, averaged].shape)
         return log_terms
-
-    def _seeds(
-        self, n: int, seeds: NDArray[np.int64] | None, rng: np.random.Generator
-    ) -> NDArray[np.int64]:
-        size = (n, len(self.density.seed_names))
-        return rng.integers(np.iinfo(np.int64).max, size=size) if seeds is None else seeds
 
 
 @dataclass(frozen=True)
@@ -162,8 +160,6 @@ def _is_bounded(rv: TensorVariable, model: pm.Model) -> bool:
 
 def _columns(model: pm.Model, names: Sequence[str]) -> NDArray[np.int64]:
     """Columns of the unconstrained vector that belong to free variables, in the order of names."""
-    point = model.initial_point()
-    sizes = [point[model.rvs_to_values[rv].name].size for rv in model.free_RVs]
-    parts = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
-    by_name = dict(zip([rv.name for rv in model.free_RVs], parts, strict=True))
-    return np.concatenate([by_name[name] for name in names] or [np.empty(0, dtype=np.int64)])
+    places = places_in_vector(model)
+    columns = [places[name].ravel() for name in names]
+    return np.concatenate([np.empty(0, dtype=np.int64), *columns])

@@ -17,6 +17,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from ...compiler.native.rows import at_points
 from ...errors import ModelError
+from ...pymc_model.elements import places_in_vector
 from ...pymc_model.ends_of_support import ends_of_support
 from ...pymc_model.inspection import parameter_graphs, state_space_nodes
 from ...pymc_model.prior import is_improper
@@ -102,8 +103,7 @@ class StrengthsAtPoints:
         self._largest = np.concatenate([largest for largest, _ in ends])
         self._is_signed = np.concatenate([is_signed for _, is_signed in ends])
         values = [model.rvs_to_values[rv] for rv in model.free_RVs]
-        point = model.initial_point()
-        self._shapes = [point[value.name].shape for value in values]
+        self._places = places_in_vector(model).values()
         scalars = pt.concatenate([pt.flatten(rv) for rv in chosen])
         jacobian = pt.sum(pt.stack([_log_jacobian(rv, model) for rv in chosen]))
         graphs = model.replace_rvs_by_values([scalars, jacobian])
@@ -115,10 +115,7 @@ class StrengthsAtPoints:
 
     def __call__(self, x: Array) -> Strengths:
         """At points x (n, k)."""
-        sizes = [int(np.prod(shape)) for shape in self._shapes]
-        columns = np.split(x, np.cumsum(sizes)[:-1], axis=1)
-        parts = [c.reshape(len(x), *shape) for c, shape in zip(columns, self._shapes, strict=True)]
-        scalars, log_jacobian = self._function(*parts)
+        scalars, log_jacobian = self._function(*(x[:, at] for at in self._places))
         return Strengths(np.abs(scalars), log_jacobian, self._largest, self._is_signed)
 
 

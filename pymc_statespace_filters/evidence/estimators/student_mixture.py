@@ -12,8 +12,8 @@ from ...statistics.importance import normalised, systematic
 from ...statistics.student_mixture import (
     StudentMixture,
     fit_mixture,
+    mixture_of,
     place_components,
-    standardised,
 )
 from ..posterior import Posterior
 from .whitening import moments
@@ -70,7 +70,5 @@ def flattened_copy(
     """The fit to `flattened` points, if there is one."""
     if not np.isfinite(log_ratio).any():
         return []
-    if (copy := standardised(flattened(x, log_ratio, rng))) is None:
-        return []
-    mixture = fit_mixture(copy.z, place_components(copy.z, n_components, rng))
-    return [mixture.affine(copy.mean, copy.chol)]
+    copy = mixture_of(flattened(x, log_ratio, rng), n_components, rng)
+    return [] if copy is None else [copy]

@@ -70,14 +70,8 @@ def reweight(
         default all, or as many as 32 000 estimates allow.
     random_seed : int or numpy.random.Generator, optional
         Of the noise of the filter, of further points and of the resampling.
-    progressbar : bool
-        Whether to show a progress bar if the evaluations take more than two seconds.
-    cores : int, optional
-        Number of threads, on which no number depends; by default one for each core that the process
-        may use.
-    comm : mpi4py.MPI.Comm, "world" or mapping, optional
-        Ranks among which the points are divided, as in `sample_dram`; the result does not depend
-        on their number. A rank whose ``idata`` is None gets that of the first.
+    progressbar, cores, comm
+        As of `estimate_evidence`.
 
     Returns
     -------

@@ -8,7 +8,6 @@ from pymc.progress_bar.rich_progress import RichProgressBackend
 from rich.console import RenderableType
 from rich.progress import ProgressColumn, TextColumn
 from rich.table import Column
-from rich.theme import Theme
 
 # Below this fraction of accepted proposals a bar turns red, and the end of a chain has a warning.
 MIN_ACCEPT_RATE = 0.01
@@ -46,8 +45,6 @@ class ChainProgress(ProgressBarManager):
     n_chains, draws, tune : int
     progressbar : bool or str
         As in ``pm.sample``: True, False, "combined", "split", "combined+stats", "split+stats".
-    theme : rich.theme.Theme or str, optional
-        Colours, or a style sheet for marimo.
 
     Raises
     ------
@@ -63,15 +60,8 @@ class ChainProgress(ProgressBarManager):
 
     step_name = "Draw"
 
-    def __init__(
-        self,
-        n_chains: int,
-        draws: int,
-        tune: int,
-        progressbar: Any = True,
-        theme: Theme | str | None = None,
-    ):
-        super().__init__(n_chains, progressbar, theme)
+    def __init__(self, n_chains: int, draws: int, tune: int, progressbar: Any = True):
+        super().__init__(n_chains, progressbar)
         chains_per_bar = n_chains if self.combined_progress else 1
         self._tune = chains_per_bar * tune
         self._totals = [draws + tune] * n_chains

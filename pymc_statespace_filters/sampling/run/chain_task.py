@@ -7,6 +7,7 @@ write a checkpoint, or to stop.
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, InitVar, dataclass
 from threading import Event
 
 import numpy as np
@@ -38,80 +39,52 @@ Candidates = Callable[[np.random.Generator], Sequence[np.ndarray]]
 Store = Callable[[Arrays, Arrays], None]  # of new draws, and the state after them
 
 
+@dataclass(eq=False)
 class ChainTask:
-    """One chain to be run.
+    """One chain to be run, from its start or from what a former call has stored of it."""
 
-    Parameters
-    ----------
-    target : Target or RecordTarget
-        Prepared.
-    tune : int
-    n_iterations : int
-        Iterations after which the chain ends; `extend` gives it more.
-    candidates : callable
-        From the chain's generator to the candidates for its start.
-    seed : numpy.random.SeedSequence
-        The chain's randomness.
-    n_rows : int
-        Draws, with those of the warm-up, that it may have after `extend`.
-    thin : int
-        Iterations after the warm-up of which one draw, the last, is kept.
-    mixture : ndarray
-        Packed, of the first proposals.
-    proposal_cov : ndarray, optional
-        Of the first proposals. Default: the target's.
-    index : int
-        Number of the chain.
-    name : str, optional
-        For messages. Default: "chain" and the index.
-    stored : Stored, optional
-        What a former call has stored of the chain.
-    store : callable, optional
-        Stores new draws and the state after them.
-    keeps_warmup : bool
-    measures_noise : bool
-        Whether the variance of the estimated log-likelihood is measured at the start.
-    former : (ChainState, int), optional
-        The state of a chain that is to go on, and the number of its iterations.
-    """
+    target: Target | RecordTarget  # prepared
+    tune: int
+    n_iterations: int  # after which the chain ends; `extend` gives it more
+    candidates: Candidates  # for its start, from the chain's generator
+    seed: InitVar[np.random.SeedSequence]  # of the chain's randomness
+    _: KW_ONLY
+    n_rows: InitVar[int]  # draws, with those of the warm-up, that it may have after `extend`
+    mixture: InitVar[np.ndarray]  # packed, of the first proposals
+    thin: InitVar[int] = 1  # iterations after the warm-up of which one draw, the last, is kept
+    proposal_cov: InitVar[np.ndarray | None] = (
+        None  # of the first proposals: by default the target's
+    )
+    index: int = 0
+    name: str = "chain 0"  # for messages
+    stored: InitVar[Stored | None] = None
+    store: Store | None = None
+    keeps_warmup: InitVar[bool] = False
+    measures_noise: bool = False  # of the estimated log-likelihood, at the start
+    former: InitVar[tuple[ChainState, int] | None] = None  # to go on, and the number of iterations
 
-    def __init__(
+    def __post_init__(
         self,
-        target: Target | RecordTarget,
-        tune: int,
-        n_iterations: int,
-        candidates: Candidates,
         seed: np.random.SeedSequence,
-        *,
         n_rows: int,
         mixture: np.ndarray,
-        thin: int = 1,
-        proposal_cov: np.ndarray | None = None,
-        index: int = 0,
-        name: str | None = None,
-        stored: Stored | None = None,
-        store: Store | None = None,
-        keeps_warmup: bool = False,
-        measures_noise: bool = False,
-        former: tuple[ChainState, int] | None = None,
-    ):
-        self._tune, self._n_iterations = tune, n_iterations
-        self._candidates, self._measures_noise = candidates, measures_noise
-        self._n_noisy = len(target.seed_names)
-        self._index, self._name = index, name or f"chain {index}"
-        self._rng = np.random.default_rng(seed)
-        n_covs = tune if keeps_warmup else 0
+        thin: int,
+        proposal_cov: np.ndarray | None,
+        stored: Stored | None,
+        keeps_warmup: bool,
+        former: tuple[ChainState, int] | None,
+    ) -> None:
+        target, n_covs = self.target, self.tune if keeps_warmup else 0
+        self.rng = np.random.default_rng(seed)
         # Pages of these arrays that are never written to take no memory.
-        self._target = target
         self.chain = chain_of(
-            target, draw_key(self._rng), n_rows, n_covs, proposal_cov, Thinning(tune, thin)
+            target, draw_key(self.rng), n_rows, n_covs, proposal_cov, Thinning(self.tune, thin)
         )
         self.chain.state.mixture[:] = mixture
         self._first, self._goes_on = 0, former is not None
         if former is not None:
             state, self._first = former
             self.chain.load_state(state)
-        self._store = store
         if stored is not None:
             self.chain.restore(*stored)
         self._n_saved = self.n_done
@@ -128,12 +101,12 @@ class ChainTask:
     @property
     def positions(self) -> np.ndarray:
         """Draws made so far, after the warm-up, shape (n, d)."""
-        return self.chain.draws.positions[self._tune : self._n_rows]
+        return self.chain.draws.positions[self.tune : self._n_rows]
 
     @property
     def _n_rows(self) -> int:
         """Draws of the iterations made so far, with those of the warm-up."""
-        return self.chain.thinning.n_rows(min(self.n_done, self._n_iterations))
+        return self.chain.thinning.n_rows(min(self.n_done, self.n_iterations))
 
     def extend(self, n_iterations: int, thin: int, mixture: np.ndarray) -> None:
         """Let the chain, which has ended, run again, until it has made so many iterations.
@@ -143,9 +116,9 @@ class ChainTask:
         """
         if thin > self.chain.thinning.every:
             self.chain.coarsen(thin)
-        if self.n_done == self._n_iterations:
+        if self.n_done == self.n_iterations:
             self.chain.state.mixture[:] = mixture
-        self._n_iterations = n_iterations
+        self.n_iterations = n_iterations
 
     def request_pause(self, stop: Event) -> None:
         """Have the chain return to Python if it is to stop or to be saved."""
@@ -157,7 +130,7 @@ class ChainTask:
         began = time.monotonic()
         try:
             failures = () if self._goes_on or self.n_done > 0 else self._start()
-            while self.n_done < self._n_iterations and not stop.is_set():
+            while self.n_done < self.n_iterations and not stop.is_set():
                 self.chain.control[PAUSE_REQUESTED] = 0  # the main thread repeats its request
                 self._advance()
                 if failures and self.n_done > 0:
@@ -171,7 +144,7 @@ class ChainTask:
         except StopRequested:
             return
         except Exception as error:
-            error.add_note(f"in {self._name}, after {self.n_done} iterations")
+            error.add_note(f"in {self.name}, after {self.n_done} iterations")
             raise
 
     def result(self) -> tuple[Draws, ChainState]:
@@ -190,7 +163,7 @@ class ChainTask:
         """Statistics for a progress bar, after at least one iteration."""
         draws, thinning = self.chain.draws, self.chain.thinning
         end = thinning.n_rows(self.n_done)
-        begin = self._tune if end > self._tune else 0
+        begin = self.tune if end > self.tune else 0
         n = thinning.n_iterations(end) - begin
         return {
             "accept_rate": float(n_accepted(draws.counts[begin:end]).mean(axis=1).sum() / n),
@@ -199,12 +172,12 @@ class ChainTask:
 
     def _start(self) -> tuple[int, ...]:
         """Find a start; for each evaluation made, 0 or its failure code."""
-        failures = self.chain.start(self._candidates(self._rng), (), self._rng)
-        if self._measures_noise:
+        failures = self.chain.start(self.candidates(self.rng), (), self.rng)
+        if self.measures_noise:
             state = self.chain.state
-            seeds = draw_seeds(self._rng, (N_SEEDS, self._n_noisy))
+            seeds = draw_seeds(self.rng, (N_SEEDS, len(self.target.seed_names)))
             spread = self.chain.seed_spread(state.position, seeds)
-            self._noisy_start = NoisyStart(self._target.model, self._index, spread)
+            self._noisy_start = NoisyStart(self.target.model, self.index, spread)
         return failures
 
     def _warn_if_stuck(self) -> None:
@@ -217,19 +190,19 @@ class ChainTask:
     def _advance(self) -> None:
         """Advance to the end of the block of random numbers, or of the phase."""
         done = self.n_done
-        tune = done < self._tune
+        tune = done < self.tune
         if tune:
-            end = min(self._tune, self._n_iterations)
+            end = min(self.tune, self.n_iterations)
             self.chain.advance(tune, done, done, end - done)
         else:
-            self.chain.advance_thinned(self._first + done, self._n_iterations - done)
+            self.chain.advance_thinned(self._first + done, self.n_iterations - done)
 
     def _must_save(self) -> bool:
         due = time.monotonic() - self._saved_at >= CHECKPOINT_SECONDS
-        return self._store is not None and due and self.n_done > self._n_saved
+        return self.store is not None and due and self.n_done > self._n_saved
 
     def _save(self) -> None:
-        if self._store is not None and self.n_done > self._n_saved:
-            self._store(*self.chain.snapshot(self._n_saved))
+        if self.store is not None and self.n_done > self._n_saved:
+            self.store(*self.chain.snapshot(self._n_saved))
             self._n_saved = self.n_done
         self._saved_at = time.monotonic()

@@ -21,7 +21,7 @@ from ..target.record_target import RecordTarget, target_of
 from ..target.target import Target
 from ..target.variables import check_no_generators
 from .chain_task import ChainTask, Store
-from .model_result import ModelResult
+from .model_result import tree_of
 from .population_search import (
     SearchedPoints,
     WarmUp,
@@ -144,7 +144,7 @@ class ModelTask:
             thin=self.thin,
             former=request.former and (request.former.states[index], request.former.iterations),
             index=index,
-            name=f"chain {index} of model {self.name!r}" if self.name else None,
+            name=f"chain {index} of model {self.name!r}" if self.name else f"chain {index}",
             stored=stored,
             store=store,
             keeps_warmup=request.keeps_warmup,
@@ -307,9 +307,14 @@ class ModelTask:
         request, found, is_complete = self.request, None, self.is_complete
         if check_convergence or request.until_ess is not None:
             found = unless_interrupted(self.convergence, None)
-        results = [self._results.pop(index) for index in range(request.chains)]
-        result = ModelResult(self, results, found, is_complete=is_complete)
-        return result.to_datatree(check_convergence=check_convergence, report_level=report_level)
+        return tree_of(
+            self,
+            [self._results.pop(index) for index in range(request.chains)],
+            found,
+            is_complete=is_complete,
+            check_convergence=check_convergence,
+            report_level=report_level,
+        )
 
 
 def _one_of(population: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:

@@ -28,10 +28,9 @@ from ..checkpoint.arrays import encoded
 from ..kernel.state import ChainState, Draws
 from ..output.chain_bars import ChainProgress
 from .chain_task import ChainTask
-from .messages import LISTENING_SECONDS, Kind, place_of
 from .model_task import ModelTask, key_of_chain
 from .thread_pool import ChainPool
-from .worker import Worker
+from .worker import LISTENING_SECONDS, Kind, Worker, place_of
 
 _ALONE_SECONDS = 0.1
 _MOST_BYTES = 2**28  # of one message

@@ -14,6 +14,7 @@ import xarray as xr
 from pymc.model import Model
 
 from ...errors import DataMismatchError, ModelError
+from ...pymc_model.elements import places_in_vector
 from ...pymc_model.posterior_draws import posterior_group, unconstrained_draws
 from ..target.settings import RandomWalkSettings
 from ..target.variables import continuous_value_vars
@@ -94,9 +95,8 @@ def _thinned(draws: np.ndarray) -> np.ndarray:
 
 def _rows(draws: np.ndarray, shared: list[str], model: Model) -> list[list[float | None]]:
     """Draws (n, k) of some variables as positions of the model, None for what they lack."""
-    point = model.initial_point(random_seed=0)
-    sizes = [point[model.rvs_to_values[rv].name].size for rv in model.free_RVs]
-    known = np.repeat([rv.name in shared for rv in model.free_RVs], sizes)
+    places = places_in_vector(model)
+    known = np.concatenate([np.full(at.size, name in shared) for name, at in places.items()])
     rows = np.full((len(draws), known.size), None, dtype=object)
     rows[:, known] = draws
     return rows.tolist()

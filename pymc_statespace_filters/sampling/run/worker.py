@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
+from enum import StrEnum, auto
 from queue import SimpleQueue
 from typing import Any
 
@@ -9,12 +10,37 @@ from ...errors import ParallelError
 from ...parallel.communicator import ABORT_GRACE_SECONDS, Communicator, describe_error
 from ..checkpoint.arrays import Arrays, decoded, encoded, joined
 from .chain_task import ChainTask
-from .messages import LISTENING_SECONDS, Kind, place_of
 from .model_task import ModelTask, key_of_chain
 from .thread_pool import ChainPool
 
+LISTENING_SECONDS = 0.02
 _PROGRESS_SECONDS = 0.25
 _ANSWER_SECONDS = 10.0
+
+
+class Kind(StrEnum):
+    """Kinds of messages between rank 0 and another one."""
+
+    # To rank 0, ...
+    IDLE = auto()
+    PROGRESS = auto()
+    RECORD = auto()  # to be stored
+    RESULT = auto()
+    FAILED = auto()
+    LEAVING = auto()
+    # ... and from it.
+    STORED = auto()  # a part of what is stored of the next chain
+    CHAIN = auto()
+    GO_ON = auto()
+    NO_MORE = auto()
+    STOP = auto()
+    OVER = auto()
+
+
+def place_of(tasks: Sequence[ModelTask], number: int) -> tuple[ModelTask, int]:
+    """The model of a chain, and its number there; chains are numbered through all models."""
+    model, chain = divmod(number, tasks[0].request.chains)
+    return tasks[model], chain
 
 
 class _StoppedByOthers(Exception):

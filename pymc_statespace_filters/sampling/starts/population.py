@@ -29,12 +29,7 @@ from ...errors import ModelError
 from ...filters.outcomes import why_zero
 from ...progress import row_progress
 from ...pymc_model.prior import can_sample
-from ...statistics.student_mixture import (
-    StudentMixture,
-    fit_mixture,
-    place_components,
-    standardised,
-)
+from ...statistics.student_mixture import StudentMixture, mixture_of
 from ..kernel.state import draw_seeds
 from ..target.initial_points import N_DRAWS
 from ..target.log_density import LogDensity
@@ -341,16 +336,10 @@ def nested_reference(known: Array, prior: Array, rng: np.random.Generator) -> St
     paired = prior[rng.integers(len(prior), size=len(known))]
     near = _fitted(np.where(lacking, paired, known), _N_COMPONENTS, rng)
     far = _fitted(prior, 1, rng)
-    return StudentMixture(
-        np.append((1 - _PRIOR_WEIGHT) * near.weights, _PRIOR_WEIGHT * far.weights),
-        np.concatenate([near.means, far.means]),
-        np.concatenate([near.chols, far.chols]),
-    )
+    return near.mixed_with(far, _PRIOR_WEIGHT)
 
 
 def _fitted(x: Array, n_components: int, rng: np.random.Generator) -> StudentMixture:
-    draws = standardised(x)
-    if draws is None:
+    if (fitted := mixture_of(x, n_components, rng)) is None:
         raise ModelError("pilot must have draws that vary in every direction")
-    placed = place_components(draws.z, n_components, rng)
-    return fit_mixture(draws.z, placed).affine(draws.mean, draws.chol)
+    return fitted

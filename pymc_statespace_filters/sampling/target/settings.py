@@ -19,29 +19,15 @@ ADAPTATIONS = ("chain", "continuous")
 class RandomWalkSettings:
     """Settings of the random walk of `sample`, `sample_dram` and `run_models`.
 
-    They are those of the step method `DRAM`, which describes the algorithm.
+    The step method `DRAM` describes the algorithm.
 
     Parameters
     ----------
-    stages : int or (int, int), default (2, 1)
-        Maximum number of proposals in an iteration, or a pair: during tuning and afterwards.
-    stage_scale : float, default 0.2
-        Factor of the standard deviations of a stage's proposals, relative to the stage before.
-    adaptation : {"chain", "continuous"}, default "chain"
-        Whether the covariance is updated after blocks of iterations, or at every one.
-    adapt_every : int, default 100
-        Iterations in a block.
+    stages, stage_scale, adaptation, adapt_every, refresh_noise, correlation, screen, screen_power
+        As of `DRAM`.
     proposal_cov : array_like, shape (d, d), optional
         Covariance of the first proposals, on the unconstrained space, in the order of the model's
         free variables. Default: found by the search for starts, or else the prior's.
-    refresh_noise : bool, default True
-        Whether each proposal has its own noise seed.
-    correlation : float, optional
-        In (0, 1): the noise of a proposal is an autoregression on that of the current point.
-    screen : filter, optional
-        A cheap filter on whose likelihood proposals are made first.
-    screen_power : float, default 0.5
-        Exponent of the likelihood of the screen.
 
     Raises
     ------
