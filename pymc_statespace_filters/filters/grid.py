@@ -24,12 +24,12 @@ from ..compiler.native.planned_function import PlannedFunction
 from ..errors import ModelError
 from .calls import OK, likelihood_entry, state_given
 from .plan import make_plan, read_system, settings_of
-from .point_mass.forward_pass import discard, write_outcome
-from .point_mass.law import STATE_SIZE, law_of_states
+from .point_mass.forward_pass import write_outcome
+from .point_mass.law import STATE_SIZE, law_before, law_of_states, new_tape
 from .point_mass.moments import FILTERED, MOMENTS
 from .point_mass.predictions import GRID_PREDICTIONS
-from .point_mass.segment_pass import along_record, discard_segments
-from .point_mass.states import GRID_RUN, GRID_STATES
+from .point_mass.segment_pass import along_record, finished
+from .point_mass.states import GRID_STATES
 from .protocol import System, check_sensor_has_noise
 from .signatures import LIKELIHOOD_OF_NOISE, PREDICTIONS, RUN, STATES
 from .state_law import StateLaw
@@ -169,7 +169,7 @@ class GridFilter:
 
     def compile_run(self, system: System) -> PlannedFunction:
         """Compile one run with all that it computes."""
-        return PlannedFunction(self._plan(system, GRID_RUN, FILTERED), *RUN)
+        return PlannedFunction(self._plan(system, GRID_STATES, FILTERED), *RUN)
 
     def _plan(
         self, system: System, run: EntryPoint, *settings: int, others: Sequence[str] = ()
@@ -191,9 +191,8 @@ class GridFilter:
 def _point_mass(plan, record, request, seed, to):
     """Write terms and health of one record."""
     system, tolerance = read_system(plan, record.theta, record.inputs), settings_of(plan)[0]
-    code, j = along_record(
-        system, record, state_given(request), tolerance, to.terms, discard, discard_segments, None
-    )
+    law, tape = law_before(system, state_given(request)), new_tape(np.empty(0, np.int64), True)
+    code, j = along_record(system, record, law, False, tolerance, to.terms, tape, finished, None)
     write_outcome(code, j, to.terms, to.health)
     return OK
 

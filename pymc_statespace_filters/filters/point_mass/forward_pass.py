@@ -1,18 +1,14 @@
-"""One pass of the point-mass filter over a record, and what the next attempt does.
-
-A pass hands its grids to ``keep(tape, k, grid, updated)``: the predicted grid of every step, and at
-an observation the updated grid too.
-"""
+"""One pass of the point-mass filter over a record on a grid, and what the next attempt does."""
 
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from ...compiler.native.jit import inline_always, njit_internal
+from ...compiler.native.jit import njit_internal
 from ..outcomes import GRID_TOO_LARGE, NO_PROCESS_NOISE, NONE, TOO_FAR, is_missing
 from ..plan import step_moments
-from .law import AT_START, OF_SEGMENTS, grid_of
+from .law import AT_START, OF_SEGMENTS, grid_of, keep_grid
 from .recursion import (
     REFINEMENT,
     TOO_COARSE,
@@ -23,12 +19,15 @@ from .recursion import (
     update,
 )
 
-LENGTHENING = 1.6
+_LENGTHENING = 1.6
 # In standard deviations: densities down to 2e-16, and down to 1e-265.
 SHORTEST_REACH, LONGEST_REACH = 8.5, 35.0
 # Of a run that leaves a state: what is cut off here is missing in all rows to come, which may be a
 # surprise. Densities down to 7e-41.
-REACH_OF_STATE = LENGTHENING * SHORTEST_REACH
+_REACH_OF_STATE = _LENGTHENING * SHORTEST_REACH
+# Relative to the tolerance: a mass on a segment that need not be resolved.
+NEGLIGIBLE = 1e-5
+_NEGLIGIBLE_OF_STATE = 1e-15  # as rows to come may be a surprise
 _PER_STEP = 1e-5  # planned error of one step, relative to the tolerance
 _COARSER = 1.2  # than planned: the error of a step stays below the tolerance
 # A density that needs more is not smooth, and segments mostly hold it at a fraction of the cost.
@@ -39,29 +38,31 @@ ON_GRID, ON_SEGMENTS, END = range(3)
 
 
 class Settings(NamedTuple):
-    """Spacing of the grid, its reach, how often it was refined, and whether it may be further."""
+    """Where the next attempt represents the density, and how finely.
 
+    A grid has a spacing and a reach, was refined so many times, and may be further. Of segments,
+    masses below the floor need not be resolved.
+    """
+
+    place: int
     spacing: float
     reach: float
     n_refined: int
     is_refinable: bool
-
-
-@inline_always
-def discard(tape, k, grid, updated):
-    """Keep no grid: a likelihood needs none."""
+    segment_reach: float
+    floor: float
 
 
 @njit_internal
-def _first_grid(system, record, law, tolerance, reach):
-    """The settings of the first attempt, with the spacing that the first step requires.
+def _first_spacing(system, record, law, tolerance):
+    """The spacing that the first step requires.
 
     The step is taken from the mean of the law and one standard deviation to either side, see
     `grid.aliasing`.
     """
     spacing, steps, (mean, sd) = np.inf, record.steps, (law.mean, law.sd)
     if steps.size == 0 or steps[-1] == law.k:
-        return Settings(spacing, reach, 0, True)
+        return spacing
     X, M = np.empty((1, 3)), np.empty((2, 3))
     for i in range(3):
         X[0, i] = mean + (i - 1) * sd
@@ -71,60 +72,69 @@ def _first_grid(system, record, law, tolerance, reach):
         width = math.sqrt(M[1, i] / (1.0 + slope * slope))
         if width > 0.0:
             spacing = min(spacing, width)
-    spacing = spacing * math.pi * math.sqrt(-2.0 / math.log(_PER_STEP * tolerance))
-    return Settings(spacing, reach, 0, True)
-
-
-@njit_internal
-def next_attempt(place, code, settings):
-    """After an attempt in this place that ended with this code: (place, settings) of the next one.
-
-    Segments are tried once. If they fail, as where mass explodes, a grid that was only too coarse
-    is refined further.
-    """
-    spacing, reach, n_refined, is_refinable = settings
-    finer = Settings(spacing * REFINEMENT, reach, n_refined + 1, is_refinable)
-    if place == ON_SEGMENTS:
-        return (ON_GRID if is_refinable and code == GRID_TOO_LARGE else END), settings
-    if code == TOO_SHORT:
-        longer = Settings(spacing, reach * LENGTHENING, n_refined, is_refinable)
-        return (ON_GRID if longer.reach < LONGEST_REACH else END), longer
-    if code == TOO_COARSE:
-        return (ON_SEGMENTS if n_refined == _MOST_REFINEMENTS else ON_GRID), finer
-    if code in (GRID_TOO_LARGE, NO_PROCESS_NOISE) and n_refined <= _MOST_REFINEMENTS:
-        return ON_SEGMENTS, Settings(spacing, reach, n_refined, False)
-    return END, settings
+    return spacing * math.pi * math.sqrt(-2.0 / math.log(_PER_STEP * tolerance))
 
 
 @njit_internal
 def first_attempt(system, record, law, tolerance, leaves_state):
-    """(place, settings) of the first attempt: a law on segments is not put on a grid again."""
-    reach = REACH_OF_STATE if leaves_state else SHORTEST_REACH
+    """The settings of the first attempt: a law on segments is not put on a grid again."""
+    reach, floor = SHORTEST_REACH, NEGLIGIBLE * tolerance
+    if leaves_state:
+        reach, floor = _REACH_OF_STATE, _NEGLIGIBLE_OF_STATE * tolerance
     if law.kind == OF_SEGMENTS:
-        return ON_SEGMENTS, Settings(np.inf, reach, 0, False)
-    return ON_GRID, _first_grid(system, record, law, tolerance, reach)
+        return Settings(ON_SEGMENTS, np.inf, reach, 0, False, reach, floor)
+    spacing = _first_spacing(system, record, law, tolerance)
+    return Settings(ON_GRID, spacing, reach, 0, True, reach, floor)
+
+
+@njit_internal
+def next_attempt(settings, code, needed):
+    """The settings after an attempt that ended with this code; ``needed`` is a floor of masses.
+
+    Segments are tried once. If they fail, as where mass explodes, a grid that was only too coarse
+    is refined further.
+    """
+    place, spacing, reach, n_refined, is_refinable, segment_reach, floor = settings
+    if place == ON_SEGMENTS:
+        place = ON_GRID if is_refinable and code == GRID_TOO_LARGE else END
+        if code == TOO_SHORT:
+            segment_reach *= _LENGTHENING
+            place = ON_SEGMENTS if segment_reach < LONGEST_REACH else END
+        elif code == TOO_COARSE:
+            place, floor = ON_SEGMENTS if needed < floor else END, needed
+    elif code == TOO_SHORT:
+        reach *= _LENGTHENING
+        place = ON_GRID if reach < LONGEST_REACH else END
+    elif code == TOO_COARSE:
+        place = ON_SEGMENTS if n_refined == _MOST_REFINEMENTS else ON_GRID
+        spacing, n_refined = spacing * REFINEMENT, n_refined + 1
+    elif code in (GRID_TOO_LARGE, NO_PROCESS_NOISE) and n_refined <= _MOST_REFINEMENTS:
+        place, is_refinable = ON_SEGMENTS, False
+    else:
+        place = END
+    return Settings(place, spacing, reach, n_refined, is_refinable, segment_reach, floor)
 
 
 @njit_internal
 def _begin(law, settings):
     """(code, grid, source) at the step of a law; its own grid is finer if the first step asks."""
-    spacing, reach, n_refined, _ = settings
+    spacing = settings.spacing
     if law.kind == AT_START:
-        return initialise(law.mean, law.sd, spacing, reach)
-    needed = spacing / REFINEMENT**n_refined
+        return initialise(law.mean, law.sd, spacing, settings.reach)
+    needed = spacing / REFINEMENT**settings.n_refined
     grid, none = grid_of(law, needed if law.spacing > _COARSER * needed else np.inf), np.empty(0)
     return np.int64(NONE if grid[2].size else GRID_TOO_LARGE), grid, (none, none, none)
 
 
 @njit_internal
-def attempt(system, record, law, settings, tolerance, terms, keep, tape):
+def pass_on_grid(system, record, law, settings, tolerance, terms, tape):
     """Write the terms of one pass; return (NONE, J), or (reason, observation) of a stop."""
     steps, observed, t0 = record.steps, record.observed, record.t0
-    spacing, reach, _, _ = settings
+    spacing, reach = settings.spacing, settings.reach
     k = law.k
     code, grid, source = _begin(law, settings)
     if code == NONE:
-        keep(tape, k, grid, False)
+        keep_grid(tape, k, grid, False)
     table = empty_table()
     error, n_grids = 0.0, 1
     for j in range(steps.size):
@@ -137,7 +147,7 @@ def attempt(system, record, law, settings, tolerance, terms, keep, tape):
                 code = TOO_COARSE
             k += 1
             if code == NONE:
-                keep(tape, k, grid, False)
+                keep_grid(tape, k, grid, False)
         if code != NONE:
             return code, j
         if is_missing(observed, j):
@@ -149,7 +159,7 @@ def attempt(system, record, law, settings, tolerance, terms, keep, tape):
         )
         if code != NONE:
             return code, j
-        keep(tape, k, grid, True)
+        keep_grid(tape, k, grid, True)
         error, n_grids = 0.0, 1
     return code, steps.size
 

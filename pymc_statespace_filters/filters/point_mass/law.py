@@ -1,4 +1,4 @@
-"""The law of the state from which a pass begins: that at step 0, or one that an earlier run left.
+"""Laws of the state: that from which a pass begins, at step 0 or left by a run, and those it keeps.
 
 What is left is the density itself, to its last bit: masses on a grid, or on segments. A vector
 holds it behind its step: the kind, how many points or segments, where the grid begins and its
@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from ...compiler.native.jit import copy_into, njit_internal
 from ..outcomes import NONE
 from ..state_law import StateLaw
-from .bisection import empty_segments
-from .grid import MAX_POINTS, normalise
+from .bisection import Segments, empty_segments
+from .grid import MAX_POINTS, grid_points, normalise
+from .moments import draw as draw_on_grid
 from .moments import mean_and_sd
 from .recursion import initial_moments
 from .segments import (
@@ -28,6 +29,7 @@ from .segments import (
     polynomial,
     weight,
 )
+from .segments import draw as draw_on_segments
 
 AT_START, OF_GRID, OF_SEGMENTS = range(3)
 
@@ -43,8 +45,8 @@ _FINER = 4  # points in place of one, where states are drawn
 class Law(NamedTuple):
     """A law at step ``k``: its kind, its mean and its standard deviation.
 
-    Masses (1, n) are those of a grid from its point ``first`` on, or (n, 16) those of segments from
-    ``low`` to ``high``. At the start there are none.
+    ``parts.mass`` (1, n) are the masses of a grid from its point ``first`` on, or (n, 16) those of
+    segments. At the start there are none.
     """
 
     k: np.int64
@@ -53,34 +55,54 @@ class Law(NamedTuple):
     sd: float
     first: np.int64
     spacing: float
-    low: np.ndarray
-    high: np.ndarray
-    mass: np.ndarray
+    parts: Segments
+
+
+@njit_internal
+def _of_masses(low, high, mass):
+    """Segments of which nothing but the masses is known."""
+    return Segments(low, high, mass, mass, mass, mass, mass)
+
+
+@njit_internal
+def law_at_start(mean, sd):
+    """A normal law at step 0."""
+    zero = np.int64(0)
+    return Law(zero, np.int64(AT_START), mean, sd, zero, 1.0, empty_segments(0))
+
+
+@njit_internal
+def law_of_grid(k, grid):
+    """The law that a grid has at step k; the grid may change later."""
+    first, spacing, mass = grid
+    mean, sd = mean_and_sd(first, spacing, mass)
+    parts = _of_masses(np.empty(1), np.empty(1), mass.copy().reshape(1, mass.size))
+    return Law(np.int64(k), np.int64(OF_GRID), mean, sd, first, spacing, parts)
+
+
+@njit_internal
+def law_of_segments(k, s, mass):
+    """The law of these masses on segments at step k."""
+    (mean, sd), kind = moments(s.low, s.high, mass), np.int64(OF_SEGMENTS)
+    parts = Segments(s.low, s.high, s.predicted, mass, s.log_likelihood, s.mean, s.sd)
+    return Law(np.int64(k), kind, mean, sd, np.int64(0), 1.0, parts)
 
 
 @njit_internal
 def law_before(system, state):
     """The law that a state of the filter holds; where there is none, the Gaussian at step 0."""
     if state.size == 0:
-        (mean, sd), none = initial_moments(system), np.empty(0)
-        return Law(
-            np.int64(0), np.int64(AT_START), mean, sd, np.int64(0), 1.0, none, none,
-            np.empty((0, 0)),
-        )  # fmt: skip
-    k, kind, n = np.int64(state[0]), np.int64(state[1]), np.int64(state[2])
-    first, spacing, values = np.int64(state[3]), state[4], state[_HEADER:]
-    low, high = np.empty(n), np.empty(n)
-    if kind == OF_GRID:
-        mass = values[:n].copy().reshape(1, n)
-        mean, sd = mean_and_sd(first, spacing, mass[0])
-        return Law(k, kind, mean, sd, first, spacing, low, high, mass)
-    mass = np.empty((n, POINTS))
+        mean, sd = initial_moments(system)
+        return law_at_start(mean, sd)
+    k, n, values = np.int64(state[0]), np.int64(state[2]), state[_HEADER:]
+    if state[1] == OF_GRID:
+        return law_of_grid(k, (np.int64(state[3]), state[4], values[:n]))
+    segments = empty_segments(n)
     for p in range(n):
         row = values[p * _OF_SEGMENT : (p + 1) * _OF_SEGMENT]
-        low[p], high[p] = row[0], row[1]
-        copy_into(mass[p], row[2:])
-    mean, sd = moments(low, high, mass)
-    return Law(k, kind, mean, sd, first, spacing, low, high, mass)
+        segments.low[p], segments.high[p] = row[0], row[1]
+        copy_into(segments.mass[p], row[2:])
+    return law_of_segments(k, segments, segments.mass)
 
 
 @njit_internal
@@ -93,22 +115,74 @@ def is_law(state):
 
 
 @njit_internal
-def leave_grid(state, k, grid):
-    """Write the law on a grid at step k."""
-    first, spacing, mass = grid
-    state[0], state[1], state[2], state[3], state[4] = k, OF_GRID, mass.size, first, spacing
-    copy_into(state[_HEADER : _HEADER + mass.size], mass)
+def leave(state, law):
+    """Write a law to a state of the filter."""
+    mass = law.parts.mass
+    n = mass.size if law.kind == OF_GRID else mass.shape[0]
+    state[0], state[1], state[2], state[3], state[4] = law.k, law.kind, n, law.first, law.spacing
+    if law.kind == OF_GRID:
+        copy_into(state[_HEADER : _HEADER + n], mass[0])
+        return
+    for p in range(n):
+        row = state[_HEADER + p * _OF_SEGMENT : _HEADER + (p + 1) * _OF_SEGMENT]
+        row[0], row[1] = law.parts.low[p], law.parts.high[p]
+        copy_into(row[2:], mass[p])
 
 
 @njit_internal
-def leave_segments(state, k, segments):
-    """Write the law on segments at step k."""
-    n = segments.low.size
-    state[0], state[1], state[2], state[3], state[4] = k, OF_SEGMENTS, n, 0.0, 1.0
-    for p in range(n):
-        row = state[_HEADER + p * _OF_SEGMENT : _HEADER + (p + 1) * _OF_SEGMENT]
-        row[0], row[1] = segments.low[p], segments.high[p]
-        copy_into(row[2:], segments.mass[p])
+def drawn_from(law, mass, u):
+    """Invert the distribution function that these masses have, at u in (0, 1)."""
+    if law.kind == OF_GRID:
+        return draw_on_grid(law.first, law.spacing, mass[0], u)
+    return draw_on_segments(law.parts.low, law.parts.high, mass, u)
+
+
+@njit_internal
+def points_of_law(law):
+    """The points of all masses, (1, n)."""
+    mass = law.parts.mass
+    if law.kind == OF_GRID:
+        return grid_points(law.first, mass.size, law.spacing)
+    X = np.empty((1, mass.size))
+    for p in range(mass.shape[0]):
+        out = X[0, p * POINTS : (p + 1) * POINTS]
+        points_of(law.parts.low[p], law.parts.high[p], out)
+    return X
+
+
+class Tape(NamedTuple):
+    """What a pass keeps: the laws at the steps ``at``, before or after an update there."""
+
+    laws: list[Law]
+    at: np.ndarray
+    is_predicted: bool
+
+
+@njit_internal
+def new_tape(at, is_predicted):
+    """A tape without laws."""
+    laws = [law_at_start(0.0, 0.0)]  # lets numba infer the type of the empty list
+    laws.clear()
+    return Tape(laws, at, is_predicted)
+
+
+@njit_internal
+def keep_grid(tape, k, grid, is_updated):
+    """Keep the grid of a wanted step; the updated one in place of the predicted one."""
+    n = len(tape.laws)
+    if not is_updated and n < tape.at.size and tape.at[n] == k:
+        tape.laws.append(law_of_grid(k, grid))
+    if is_updated and not tape.is_predicted and n > 0 and tape.at[n - 1] == k:
+        tape.laws[n - 1] = law_of_grid(k, grid)
+
+
+@njit_internal
+def keep_segments(tape, k, segments):
+    """Keep the segments of a wanted step."""
+    n = len(tape.laws)
+    if n < tape.at.size and tape.at[n] == k:
+        mass = segments.predicted if tape.is_predicted else segments.mass
+        tape.laws.append(law_of_segments(k, segments, mass))
 
 
 @njit_internal
@@ -142,7 +216,7 @@ def _between(mass, largest, x):
 @njit_internal
 def grid_of(law, spacing):
     """The grid of a law on a grid, with at most this spacing; none if it has too many points."""
-    mass, coarse = law.mass[0], law.spacing
+    mass, coarse = law.parts.mass[0], law.spacing
     if mass.size == 1 or spacing >= coarse:
         return law.first, coarse, mass.copy()
     first = np.int64(math.ceil(law.first * coarse / spacing))
@@ -160,7 +234,7 @@ def on_segments(law):
     """The same law on segments; that at the start is left as it is."""
     if law.kind != OF_GRID:
         return law
-    mass, h, begin = law.mass[0], law.spacing, law.first * law.spacing
+    mass, h, begin = law.parts.mass[0], law.spacing, law.first * law.spacing
     n = -(-(mass.size - 1) // max(4, -(-mass.size // MAX_SEGMENTS)))
     low, high, masses = np.empty(max(n, 1)), np.empty(max(n, 1)), np.zeros((max(n, 1), POINTS))
     width, largest, x = (mass.size - 1) * h / max(n, 1), mass.max(), np.empty(POINTS)
@@ -172,32 +246,34 @@ def on_segments(law):
             masses[p, i] *= weight(low[p], high[p], i) / h
     if n == 0:
         masses[0, 0] = 1.0
-    return Law(law.k, np.int64(OF_SEGMENTS), law.mean, law.sd, law.first, h, low, high, masses)
+    parts = _of_masses(low, high, masses)
+    return Law(law.k, np.int64(OF_SEGMENTS), law.mean, law.sd, law.first, h, parts)
 
 
 @njit_internal
 def segments_of_law(law):
     """(code, segments, number): those of a law on segments."""
-    segments, n = empty_segments(MAX_SEGMENTS), law.low.size
-    copy_into(segments.low[:n], law.low)
-    copy_into(segments.high[:n], law.high)
+    segments, n = empty_segments(MAX_SEGMENTS), law.parts.low.size
+    copy_into(segments.low[:n], law.parts.low)
+    copy_into(segments.high[:n], law.parts.high)
     return np.int64(NONE), segments, n
 
 
 @njit_internal
 def density_of_law(law, low, high, x, out):
     """Write the density of a law on segments at points x of a part of one of them."""
+    lows, highs, mass = law.parts.low, law.parts.high, law.parts.mass
     middle, p = 0.5 * (low + high), 0
-    while p < law.low.size - 1 and law.high[p] < middle:
+    while p < lows.size - 1 and highs[p] < middle:
         p += 1
-    values, centre = np.empty(POINTS), 0.5 * (law.low[p] + law.high[p])
+    values, centre = np.empty(POINTS), 0.5 * (lows[p] + highs[p])
     for i in range(POINTS):
-        values[i] = law.mass[p, i] / weight(law.low[p], law.high[p], i)
-    inside = law.low[p] <= middle <= law.high[p]
+        values[i] = mass[p, i] / weight(lows[p], highs[p], i)
+    inside = lows[p] <= middle <= highs[p]
     for b in range(POINTS):
         out[b] = 0.0
         if inside:
-            v = 2.0 * (x[b] - centre) / (law.high[p] - law.low[p])
+            v = 2.0 * (x[b] - centre) / (highs[p] - lows[p])
             out[b] = max(polynomial(values, min(max(v, -1.0), 1.0)), 0.0)
 
 

@@ -15,18 +15,15 @@ import numpy as np
 from ...compiler.native.jit import keep_alive, njit_internal
 from ...compiler.native.plan import RECORD, REQUEST, RESULTS, plan_entry
 from ..calls import OK, opened, reals_at, single_record
-from ..outcomes import NONE
 from ..plan import PLAN, read_system, settings_of, simulate
-from .grid import grid_points
+from .law import law_before, new_tape, points_of_law
 from .moments import total_mass
-from .segment_pass import along_record
-from .segments import POINTS, points_of
+from .segment_pass import along_record, finished
 
 
 class Laws(NamedTuple):
-    """What is written; ``next`` (1,) is the number of the next observation."""
+    """What is written, see `signatures.PREDICTIONS`."""
 
-    next: np.ndarray
     mean: np.ndarray
     cov: np.ndarray
     log_below: np.ndarray
@@ -40,14 +37,10 @@ def _grid_predictions(plan, record, request, results):
     J = call.record[RECORD.n_rows]
     data, laws = single_record(call, 0, 0, J), unknown_laws(call)
     system, tolerance = read_system(call.plan, data.theta, data.inputs), settings_of(call.plan)[0]
-    if system.failure != NONE:
-        return status
-    code, j = along_record(
-        system, data, np.empty(0), tolerance, np.empty(J), _predict, _predict_on_segments,
-        (system, data, laws),
-    )  # fmt: skip
-    if code != NONE:
-        forget(laws, j)
+    law, tape = law_before(system, np.empty(0)), new_tape(data.steps, True)
+    _, known = along_record(system, data, law, False, tolerance, np.empty(J), tape, finished, None)
+    for j in range(known):
+        _write_law(system, data, tape.laws[j], laws, j)
     return status
 
 
@@ -56,58 +49,23 @@ def unknown_laws(call):
     """The laws that a call asks for, which are still to be written."""
     to, p, J = call.results, call.plan[PLAN.p], call.record[RECORD.n_rows]
     laws = Laws(
-        np.zeros(1, np.int64), reals_at(to[RESULTS.predicted], (J, p)),
-        reals_at(to[RESULTS.predicted_cov], (J, p, p)), reals_at(to[RESULTS.log_below], (J, p)),
-        reals_at(to[RESULTS.log_above], (J, p)),
+        reals_at(to[RESULTS.predicted], (J, p)), reals_at(to[RESULTS.predicted_cov], (J, p, p)),
+        reals_at(to[RESULTS.log_below], (J, p)), reals_at(to[RESULTS.log_above], (J, p)),
     )  # fmt: skip
-    forget(laws, 0)
+    laws.mean[:], laws.cov[:], laws.log_below[:], laws.log_above[:] = np.nan, np.nan, np.nan, np.nan
     return laws
 
 
 @njit_internal
-def forget(laws, first):
-    """Leave the laws from a failing observation on unknown."""
-    for j in range(first, laws.mean.shape[0]):
-        for b in range(laws.mean.shape[1]):
-            laws.mean[j, b] = laws.log_below[j, b] = laws.log_above[j, b] = np.nan
-            for a in range(laws.mean.shape[1]):
-                laws.cov[j, a, b] = np.nan
+def _write_law(system, record, law, laws, j):
+    """Write the law of row j from that of the state before it.
 
-
-@njit_internal
-def _predict(tape, k, grid, updated):
-    """Write the law of the observation at step k, if there is one, from the grid before it."""
-    low, spacing, mass = grid
-    if not updated:
-        _write_law(tape, k, grid_points(low, mass.size, spacing), mass, mass.size)
-
-
-@njit_internal
-def _predict_on_segments(tape, k, segments):
-    """The same from segments."""
-    n = segments.low.size
-    X = np.empty((1, n * POINTS))
-    for p in range(n):
-        points_of(segments.low[p], segments.high[p], X[0, p * POINTS : (p + 1) * POINTS])
-    _write_law(tape, k, X, segments.predicted.reshape(n * POINTS), POINTS)
-
-
-@njit_internal
-def _write_law(tape, k, X, mass, n_together):
-    """Write the law of the next observation, if it is at step k, from masses at the points X.
-
-    So many points in turn lie beside each other, and the next ones may be elsewhere.
+    As many points as a row of masses has lie beside each other; the next ones may be elsewhere.
     """
-    system, record, laws = tape
-    if k == 0:  # the first pass, or a repeated one
-        laws.next[0] = 0
-    j = laws.next[0]
-    if j == record.steps.size or record.steps[j] != k:
-        return
-    laws.next[0] = j + 1
-    h, roots = observations_at(system, k, record.t0 + k * system.dt, X)
-    weight = 1.0 / total_mass(mass)
-    write_mixture(mass, weight, n_together, h, roots, record.observed[j], laws, j)
+    h, roots = observations_at(system, law.k, record.t0 + law.k * system.dt, points_of_law(law))
+    n_together = law.parts.mass.shape[1]
+    mass = law.parts.mass.reshape(law.parts.mass.size)
+    write_mixture(mass, 1.0 / total_mass(mass), n_together, h, roots, record.observed[j], laws, j)
 
 
 @njit_internal

@@ -1,4 +1,4 @@
-"""States on segments: moments and draws of the state at chosen steps, see the module `states`."""
+"""The backward pass on segments, see the module `states`."""
 
 import math
 
@@ -8,79 +8,30 @@ from ...compiler.native.jit import njit_internal
 from ...compiler.numerics.philox import STATES, uniform_at
 from ...compiler.numerics.restricted_domain import exp
 from ..outcomes import NONE
-from .bisection import empty_segments
 from .forward_pass import LONGEST_REACH
-from .law import leave_segments, on_segments
-from .moments import PREDICTED, SMOOTHED
 from .recursion import TOO_COARSE, TOO_SHORT
-from .segment_pass import first_accuracy, next_accuracy, pass_from
 from .segments import POINTS, draw, mean_over_gaussian, moments
 
 _FINER = 1e-10  # the next floor, where smoothed mass lies on segments that were not resolved
 
 
 @njit_internal
-def states_on_segments(system, record, law, is_wide, tolerance, moment, rows, stored, terms, after):
-    """Write rows and terms; return (NONE, J), or (reason, observation) of a failure."""
-    kept = [empty_segments(1)]  # lets numba infer the type of the empty list
-    tape, again, steps, law = (kept, stored, law.k), True, record.steps, on_segments(law)
-    reach, floor = first_accuracy(tolerance, is_wide)
-    while again:
-        code, j, reach, floor = pass_from(
-            system, record, law, reach, floor, tolerance, terms, _keep, tape
-        )
-        if moment == SMOOTHED and code == NONE and rows.at.size:
-            code, j = _smooth(steps, floor, tolerance, rows, kept, stored)
-            code, reach, floor = next_accuracy(code, reach, floor, _FINER * floor)
-        again = code < NONE
-    if moment != SMOOTHED:
-        _write_rows(rows, kept, moment)
-        if after.size and code == NONE and stored.size:
-            leave_segments(after, stored[-1], kept[-1])
-    return code, j
-
-
-@njit_internal
-def _keep(tape, k, segments):
-    """Append the segments of a stored step to the tape, which a repeated pass starts anew."""
-    kept, stored, first = tape
-    if k == first:
-        kept.clear()
-    n = len(kept)
-    if n < stored.size and stored[n] == k:
-        kept.append(segments)
-
-
-@njit_internal
-def _write_rows(rows, kept, moment):
-    """Write moments and a draw; rows that were not reached are NaN."""
-    for i in range(rows.at.size):
-        rows.mean[i], rows.sd[i], rows.drawn[i] = np.nan, np.nan, np.nan
-        if i < len(kept):
-            here = kept[i]
-            u = uniform_at(rows.draw_seed, STATES, rows.at[i], 0)
-            mass = here.predicted if moment == PREDICTED else here.mass
-            rows.mean[i], rows.sd[i] = moments(here.low, here.high, mass)
-            rows.drawn[i] = draw(here.low, here.high, mass, u)
-
-
-@njit_internal
-def _smooth(steps, floor, tolerance, rows, kept, stored):
-    """Write the smoothed rows in a backward pass; return (NONE, J), or (reason, observation)."""
-    later = kept[-1]
+def smooth_segments(steps, floor, tolerance, rows, tape):
+    """Write the smoothed rows in a backward pass: (code, observation, floor needed)."""
+    at, later = tape.at, tape.laws[-1].parts
     ratio, factor, drawn = np.ones(later.mass.shape), np.ones(later.mass.shape), 0.0
     i, j = rows.at.size - 1, steps.size - 1
-    for row in range(stored.size - 1, -1, -1):
-        k, here = stored[row], kept[row]
+    for row in range(at.size - 1, -1, -1):
+        k, here = at[row], tape.laws[row].parts
         weights = here.mass
-        if k < stored[-1]:
+        if k < at[-1]:
             ratio = _mean_after_step(here, later, factor)
             weights = _backward_weights(here, drawn)
         smoothed = here.mass * ratio
         whole = smoothed.sum()
         code = _verdict(here, smoothed, whole, floor, tolerance)
         if code != NONE:
-            return code, min(j + 1, steps.size - 1)
+            return code, min(j + 1, steps.size - 1), _FINER * floor
         drawn = draw(here.low, here.high, weights, uniform_at(rows.draw_seed, STATES, k, 0))
         if rows.at[i] == k:
             rows.mean[i], rows.sd[i] = moments(here.low, here.high, smoothed)
@@ -89,7 +40,7 @@ def _smooth(steps, floor, tolerance, rows, kept, stored):
         if j >= 0 and steps[j] == k:
             j -= 1
         factor, later = _with_observation(here, ratio, whole), here
-    return NONE, steps.size
+    return NONE, steps.size, floor
 
 
 @njit_internal

@@ -22,179 +22,102 @@ from ...compiler.native.jit import inline_always, njit_internal
 from ...compiler.native.plan import HEALTH_SIZE, RECORD, REQUEST, RESULTS, STATE, plan_entry
 from ...compiler.numerics.philox import STATES, uniform_at
 from ...compiler.numerics.restricted_domain import exp
-from ..calls import (
-    ALL_STEPS,
-    OK,
-    integers_at,
-    opened,
-    reals_at,
-    single_record,
-    state_given,
-    state_wanted,
-    wanted_rows,
-)
-from ..outcomes import GRID_TOO_LARGE, NONE, OUT_OF_MEMORY, is_missing
+from ..calls import OK, opened, reals_at, single_record, state_given, state_wanted, wanted_rows
+from ..outcomes import NONE, OUT_OF_MEMORY, is_missing
 from ..plan import log_density, read_system, settings_of
-from .forward_pass import (
-    END,
-    ON_SEGMENTS,
-    attempt,
-    first_attempt,
-    next_attempt,
-    write_outcome,
-)
+from .forward_pass import ON_GRID, write_outcome
 from .grid import gather, grid_points
-from .law import is_law, law_before, leave_grid
-from .moments import PREDICTED, SMOOTHED, Rows, draw, mean_and_sd, total_mass
+from .law import drawn_from, is_law, law_before, leave, new_tape
+from .moments import PREDICTED, SMOOTHED, Rows, mean_and_sd, total_mass
 from .recursion import TOO_SHORT, empty_table, transition_at, with_sources
-from .segment_states import states_on_segments
+from .segment_pass import along_record, finished
+from .segment_states import smooth_segments
 from .tiles import LANES, block_of, multiply
 
 
 @njit_internal
-def _write_moments(call, rows, drawn):
-    """Write mean and deviation of the state at rows, and terms; (code, failing observation)."""
-    to, J = call.results, call.record[RECORD.n_rows]
-    data, settings = single_record(call, 0, 0, J), settings_of(call.plan)
-    tolerance, moment = settings[0], int(settings[1])
+def _room(address, size):
+    """The numbers at an address, or others where none are wanted."""
+    return reals_at(address, (size,)) if address != 0 else np.empty(size)
+
+
+def _grid_states(plan, record, request, results):
+    """Moments, and draws or a run, whichever are wanted."""
+    status, call = opened(plan, record, request, results)
+    if status != OK or call.request[REQUEST.sizes_only]:
+        return status
+    to, J, before = call.results, call.record[RECORD.n_rows], state_given(call.request)
+    data, settings, at = single_record(call, 0, 0, J), settings_of(call.plan), wanted_rows(call)
+    if before.size and not (is_law(before) and (J == 0 or before[0] < data.steps[0])):
+        return np.int64(STATE)
+    tolerance, moment, R = settings[0], int(settings[1]), at.size
     system = read_system(call.plan, data.theta, data.inputs)
-    mean = reals_at(to[RESULTS.mean], (rows.size,))
-    sd = reals_at(to[RESULTS.sd], (rows.size,)) if to[RESULTS.sd] != 0 else np.empty(rows.size)
-    terms = reals_at(to[RESULTS.terms], (J,)) if to[RESULTS.terms] != 0 else np.empty(J)
+    mean, sd = reals_at(to[RESULTS.mean], (R,)), _room(to[RESULTS.sd], R)
+    drawn, cov = _room(to[RESULTS.drawn], R), _room(to[RESULTS.cov], R)
+    n_effective, terms = _room(to[RESULTS.n_effective_wanted], R), _room(to[RESULTS.terms], J)
     health = reals_at(to[RESULTS.health], (HEALTH_SIZE,))
     # What stays if memory ends.
     mean[:], sd[:], drawn[:], terms[:] = np.nan, np.nan, np.nan, -np.inf
     health[0], health[1], health[2] = np.inf, OUT_OF_MEMORY, 0.0
-    wanted = Rows(rows, call.request[REQUEST.draw_seed], mean, sd, drawn)
-    code, j = _evaluate(call, system, data, tolerance, moment, wanted, terms)
-    for i in range(rows.size):
-        if code != NONE and (moment == SMOOTHED or j == 0 or rows[i] >= data.steps[j]):
+    rows = Rows(at, call.request[REQUEST.draw_seed], mean, sd, drawn)
+    code, j = _evaluate(system, data, before, tolerance, moment, rows, terms, state_wanted(call))
+    for i in range(R):
+        if code != NONE and (moment == SMOOTHED or j == 0 or at[i] >= data.steps[j]):
             mean[i], sd[i], drawn[i] = np.nan, np.nan, np.nan
-    write_outcome(code, j, terms, health)
-    return sd
-
-
-def _grid_states(plan, record, request, results):
-    status, call = opened(plan, record, request, results)
-    if status != OK or call.request[REQUEST.sizes_only]:
-        return status
-    rows = wanted_rows(call)
-    _write_moments(call, rows, reals_at(call.results[RESULTS.drawn], (rows.size,)))
-    mean = reals_at(call.results[RESULTS.mean], (rows.size,))
-    n_effective = reals_at(call.results[RESULTS.n_effective_wanted], (rows.size,))
-    for i in range(rows.size):
-        n_effective[i] = np.nan if np.isnan(mean[i]) else np.inf
-    return status
-
-
-@njit_internal
-def _first_step(call):
-    """The step of the first row."""
-    return integers_at(call.record[RECORD.rows], 1)[0] if call.record[RECORD.n_rows] else ALL_STEPS
-
-
-def _grid_run(plan, record, request, results):
-    status, call = opened(plan, record, request, results)
-    if status != OK or call.request[REQUEST.sizes_only]:
-        return status
-    before = state_given(call.request)
-    if before.size and not (is_law(before) and before[0] < _first_step(call)):
-        return np.int64(STATE)
-    rows = wanted_rows(call)
-    sd = _write_moments(call, rows, np.empty(rows.size))
-    cov = reals_at(call.results[RESULTS.cov], (rows.size,))
-    for i in range(rows.size):
         cov[i] = sd[i] * sd[i]
+        n_effective[i] = np.nan if np.isnan(mean[i]) else np.inf
+    write_outcome(code, j, terms, health)
     return status
 
 
 @njit_internal
-def _evaluate(call, system, record, tolerance, moment, rows, terms):
+def _evaluate(system, record, before, tolerance, moment, rows, terms, after):
     """Write rows, terms and the state left; return (NONE, J), or (reason, observation)."""
-    before, after = state_given(call.request), state_wanted(call)
+    at, steps = rows.at, record.steps
+    if moment == SMOOTHED and rows.at.size:
+        at = np.arange(rows.at[0], steps[-1] + 1)
+    elif after.size and steps.size and not (rows.at.size and rows.at[-1] == steps[-1]):
+        at = np.append(rows.at, steps[-1])
+    tape, law = new_tape(at, moment == PREDICTED), law_before(system, before)
     if after.size:
         after[:] = np.nan
-    if system.failure != NONE:
-        return np.int64(system.failure), np.int64(0)
-    stored, steps = rows.at, record.steps
     if moment == SMOOTHED and rows.at.size:
-        stored = np.arange(rows.at[0], steps[-1] + 1)
-    elif after.size and steps.size and not (rows.at.size and rows.at[-1] == steps[-1]):
-        stored = np.append(rows.at, steps[-1])
-    law, is_wide = law_before(system, before), after.size > 0
-    place, settings = first_attempt(system, record, law, tolerance, is_wide)
-    while place != END:
-        if place == ON_SEGMENTS:
-            code, j = states_on_segments(
-                system, record, law, is_wide, tolerance, moment, rows, stored, terms, after
-            )
-        else:
-            code, j = _states_on_grid(
-                system, record, law, settings, tolerance, moment, rows, stored, terms, after
-            )
-        place, settings = next_attempt(place, code, settings)
-        if place == END and code == GRID_TOO_LARGE and is_wide:
-            is_wide = False
-            place, settings = first_attempt(system, record, law, tolerance, is_wide)
+        return along_record(system, record, law, False, tolerance, terms, tape, _smooth, rows)
+    code, j = along_record(
+        system, record, law, after.size > 0, tolerance, terms, tape, finished, rows
+    )
+    for i in range(min(rows.at.size, len(tape.laws))):
+        here, u = tape.laws[i], uniform_at(rows.draw_seed, STATES, rows.at[i], 0)
+        rows.mean[i], rows.sd[i] = here.mean, here.sd
+        rows.drawn[i] = drawn_from(here, here.parts.mass, u)
+    if after.size and code == NONE and len(tape.laws):
+        leave(after, tape.laws[-1])
     return code, j
-
-
-@njit_internal
-def _states_on_grid(system, record, law, settings, tolerance, moment, rows, stored, terms, after):
-    """One attempt: write rows and terms; return (NONE, J), or (reason, observation) of a stop."""
-    grids = [(np.int64(0), 1.0, terms)]  # lets numba infer the type of the empty list
-    grids.clear()
-    tape = grids, stored, moment
-    code, j = attempt(system, record, law, settings, tolerance, terms, _keep, tape)
-    if moment != SMOOTHED:
-        _write_rows(rows, grids)
-        if after.size and code == NONE and grids:
-            leave_grid(after, stored[-1], grids[-1])
-    elif code == NONE and rows.at.size:
-        code, j = _smooth(system, record, settings, tolerance, terms, tape, rows)
-    return code, j
-
-
-@njit_internal
-def _keep(tape, k, grid, updated):
-    """Append the grid of a stored step to the tape; an updated grid replaces the predicted one."""
-    grids, stored, moment = tape
-    n = len(grids)
-    low, spacing, mass = grid
-    if not updated:
-        if n < stored.size and stored[n] == k:
-            grids.append((low, spacing, mass.copy()))  # the next step may change the masses
-    elif moment != PREDICTED and n > 0 and stored[n - 1] == k:
-        grids[n - 1] = low, spacing, mass.copy()
-
-
-@njit_internal
-def _write_rows(rows, grids):
-    """Write moments and a draw of each grid; rows that were not reached are NaN."""
-    for i in range(rows.at.size):
-        rows.mean[i], rows.sd[i], rows.drawn[i] = np.nan, np.nan, np.nan
-        if i < len(grids):
-            low, spacing, mass = grids[i]
-            rows.mean[i], rows.sd[i] = mean_and_sd(low, spacing, mass)
-            u = uniform_at(rows.draw_seed, STATES, rows.at[i], 0)
-            rows.drawn[i] = draw(low, spacing, mass, u)
 
 
 @njit_internal
 def _smooth(system, record, settings, tolerance, terms, tape, rows):
-    """Write the smoothed rows in a backward pass; return (NONE, J), or (reason, observation)."""
+    """Write the smoothed rows in a backward pass: (code, observation, floor needed)."""
+    if settings.place == ON_GRID:
+        code, j = _smooth_grids(system, record, settings, tolerance, terms, tape, rows)
+        return code, j, settings.floor
+    return smooth_segments(record.steps, settings.floor, tolerance, rows, tape)
+
+
+@njit_internal
+def _smooth_grids(system, record, settings, tolerance, terms, tape, rows):
+    """The same on grids: (NONE, J), or (reason, observation)."""
     steps, observed, t0 = record.steps, record.observed, record.t0
-    spacing, reach, _, _ = settings
-    grids, stored, _ = tape
-    table, later = empty_table(), grids[-1]
-    weights, ratio = later[2], np.ones(later[2].size)
-    drawn = 0.0
+    spacing, reach = settings.spacing, settings.reach
+    at, table, later = tape.at, empty_table(), tape.laws[-1]
+    ratio, drawn = np.ones(later.parts.mass.size), 0.0
     i, j = rows.at.size - 1, steps.size - 1
-    for row in range(stored.size - 1, -1, -1):
-        k, grid = stored[row], grids[row]
+    for row in range(at.size - 1, -1, -1):
+        k, here = at[row], tape.laws[row]
+        grid = here.first, here.spacing, here.parts.mass[0]
         low, grid_spacing, mass = grid
-        t = t0 + k * system.dt
-        if k < stored[-1]:
+        t, weights = t0 + k * system.dt, mass
+        if k < at[-1]:
             mean, sd, ratio, table = _predict_adjoint(
                 system, k, t, spacing, reach, grid, table, later, ratio
             )
@@ -202,7 +125,8 @@ def _smooth(system, record, settings, tolerance, terms, tape, rows):
         smoothed = mass * ratio
         if not _is_contained(smoothed, tolerance):
             return TOO_SHORT, min(j + 1, steps.size - 1)
-        drawn = draw(low, grid_spacing, weights, uniform_at(rows.draw_seed, STATES, k, 0))
+        u = uniform_at(rows.draw_seed, STATES, k, 0)
+        drawn = drawn_from(here, weights.reshape(1, weights.size), u)
         if rows.at[i] == k:
             rows.mean[i], rows.sd[i] = mean_and_sd(low, grid_spacing, smoothed)
             rows.drawn[i] = drawn
@@ -211,23 +135,23 @@ def _smooth(system, record, settings, tolerance, terms, tape, rows):
             if not is_missing(observed, j):
                 _update_adjoint(system, k, t, observed[j], grid, terms[j], ratio)
             j -= 1
-        later = grid
+        later = here
     return NONE, steps.size
 
 
 @njit_internal
 def _predict_adjoint(system, k, t, spacing, reach, grid, table, later, ratio):
-    """Carry the ratio from the grid ``later`` one step back: (mean, sd, ratio, table)."""
+    """Carry the ratio from the law ``later`` one step back: (mean, sd, ratio, table)."""
     low, _, mass = grid
     tabled, mean, sd, _, table = transition_at(system, k, t, spacing, reach, grid, table)
-    if tabled and later[1] == spacing:
-        end = block_of(later[0] + ratio.size - 1) + 1
-        table = with_sources(table, spacing, reach, block_of(later[0]), end)
+    if tabled and later.spacing == spacing:
+        end = block_of(later.first + ratio.size - 1) + 1
+        table = with_sources(table, spacing, reach, block_of(later.first), end)
         first, end = block_of(low), block_of(low + mass.size - 1) + 1
-        rows = multiply(table.tiles, later[0], ratio, first, end - first)
+        rows = multiply(table.tiles, later.first, ratio, first, end - first)
         ratio = rows[low - LANES * first : low - LANES * first + mass.size]
     else:
-        ratio = gather(later[0], later[1], ratio, mean, sd, reach)
+        ratio = gather(later.first, later.spacing, ratio, mean, sd, reach)
     return mean, sd, ratio, table
 
 
@@ -264,4 +188,4 @@ def _update_adjoint(system, k, t, d, grid, term, ratio):
 
 
 GRID_STATES = plan_entry(_grid_states, "grid_states")
-GRID_RUN = plan_entry(_grid_run, "grid_run")
+"""States at chosen steps, and whole runs."""
