@@ -30,7 +30,7 @@ ROOT = Path(__file__).parents[1]
 # A run with a checkpoint that is resumed, its files, cores, and interrupts.
 WITHOUT_LINUX = (
     "tests/runs_elsewhere.py",
-    "tests/parallel/test_cpu_affinity.py",
+    "tests/parallel/test_shared_rows.py",
     "tests/sampling/test_interrupts.py",
     "tests/sampling/test_checkpoint_file.py",
     "tests/sampling/test_checkpoint_folder.py",

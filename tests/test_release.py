@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 import pymc_statespace_filters as psf
-from tests.test_readme import code_of
+from tests.test_public_names import code_of
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))

@@ -1,11 +1,17 @@
 """Rows of a calculation that ranks share, on one rank that plays the first of two."""
 
+import os
 import signal
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from pymc_statespace_filters.parallel.cpu_affinity import (
+    allowed_cores,
+    available_cores,
+    cores_per_process,
+)
 from pymc_statespace_filters.parallel.shared_rows import (
     evaluated_rows,
     outlasting_interrupts,
@@ -79,3 +85,28 @@ def looked_at(look):
 def test_without_ranks_an_interrupt_ends_it():
     assert looked_at(lambda: "a look") == "a look"
     assert looked_at(lambda: signal.raise_signal(signal.SIGINT)) == "not looked at"
+
+
+# Processors of a computer on which several processes run.
+
+
+def test_this_process():
+    assert available_cores() == len(allowed_cores()) >= 1
+    if hasattr(os, "sched_getaffinity"):
+        assert allowed_cores() == os.sched_getaffinity(0)
+
+
+@pytest.mark.parametrize(
+    ("used", "shares"),
+    [
+        ([{0, 1, 2, 3}], [4]),
+        ([{0, 1}] * 2, [1, 1]),  # free to use both
+        ([{0}, {1}], [1, 1]),  # each bound to one
+        ([{0, 1, 2, 3}, {4, 5, 6, 7}], [4, 4]),  # each bound to some
+        ([{0, 1, 2, 3}] * 2 + [{4, 5, 6, 7}] * 2, [2] * 4),  # to a socket
+        ([set(range(6))] * 3, [2] * 3),  # thirds add up
+        ([{0, 1}] * 4, [1] * 4),  # more processes than processors
+    ],
+)
+def test_shares(used, shares):
+    assert [cores_per_process(i, used) for i in range(len(used))] == shares

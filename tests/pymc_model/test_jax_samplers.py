@@ -10,7 +10,7 @@ from scipy.stats import halfnorm, norm
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import GradientUnavailableError
 from tests.systems import FORCE, FORCED, FORCED_DATA, FREE, STEPS, forced_terms
-from tests.test_readme import run_code_of
+from tests.test_public_names import run_code_of
 
 jax = pytest.importorskip("jax")
 # Before the samplers: PyMC sets the number of JAX's devices here, and they make JAX count them.

@@ -8,6 +8,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.sampling.nuts import chains
+from pymc_statespace_filters.sampling.nuts import chains as nuts_chains
 
 STEPS = np.arange(1, 41)
 WALK = psf.StateSpaceModel(
@@ -91,3 +92,36 @@ def test_an_interrupted_run_says_nothing_of_the_limits_that_it_had(
 def at_most(n, convergence):
     """The diagnostics of the first draws, as chains go on until the run looks at them."""
     return lambda positions: convergence([each[:n] for each in positions])
+
+
+# Chains of NUTS that diverge end where more iterations do not help, and say so.
+
+
+ERRORS = np.array([15.0, 10.0, 16.0, 11.0, 9.0, 11.0, 10.0, 18.0])
+EFFECTS = np.array([28.0, 8.0, -3.0, 7.0, -1.0, 1.0, 18.0, 12.0])
+CALL = {"sampler": "nuts", "random_seed": 1, "progressbar": False}
+
+
+def schools(*, centred):
+    with pm.Model() as model:
+        mu, tau = pm.Normal("mu", 0, 5), pm.HalfCauchy("tau", 5)
+        theta = (
+            pm.Normal("theta", mu, tau, shape=8) if centred else mu + tau * pm.Normal("z", shape=8)
+        )
+        pm.Normal("y", theta, ERRORS, observed=EFFECTS)
+    return model
+
+
+def test_a_funnel_ends_the_run_at_the_first_doubling_that_does_not_help(caplog):
+    tree = psf.sample(250, tune=500, model=schools(centred=True), **CALL)
+
+    assert 2 <= tree.attrs["iterations_per_draw"] <= 8  # of 64
+    assert "draws diverged, most where tau is small" in caplog.text
+    assert "More iterations do not help draws that diverge: use sampler='dram'" in caplog.text
+    assert "would do" not in caplog.text  # no number of iterations does
+
+
+def test_chains_that_do_not_diverge_go_on_however_little_they_gain(monkeypatch):
+    monkeypatch.setattr(nuts_chains, "_LEAST_GROWTH", 1e6)
+    tree = psf.sample(100, tune=300, until_ess=395, model=schools(centred=False), **CALL)
+    assert tree.attrs["iterations_per_draw"] > 2

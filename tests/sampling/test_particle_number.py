@@ -14,7 +14,7 @@ from pymc_statespace_filters.sampling.particle_number import (
     _suggestion,
 )
 from tests.systems import autoregression, log_likelihoods, simulated
-from tests.test_readme import run_code_of
+from tests.test_public_names import run_code_of
 
 pytestmark = pytest.mark.usefixtures("interpreted")
 
