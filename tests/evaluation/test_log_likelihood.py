@@ -1,7 +1,6 @@
 """Log-likelihoods of a record: timing, missing data, densities of every kind, batches."""
 
 import sys
-import warnings
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 from scipy import stats
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.testing import kalman_log_likelihood
 
 
@@ -64,29 +62,6 @@ def test_an_observation_sees_the_inputs_of_its_own_step():
         np.testing.assert_allclose(terms, plain, rtol=1e-9, atol=1e-9)
 
 
-def test_singular_noise_and_a_known_start():
-    """A velocity is pushed, a position follows; both start known."""
-    A, B = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.0], [1.0]])
-    system = psf.StateSpaceModel(
-        transition=lambda x, q: A @ x + q,
-        process_noise=[[0.0, 0.0], [0.0, 0.2]],
-        observation=lambda x: [x[0]],
-        observation_noise=[[0.1]],
-        initial_mean=[1.0, 0.0],
-        initial_cov=np.zeros((2, 2)),
-    )
-    true = kalman_log_likelihood(
-        A, 0.2 * B @ B.T, [[1.0, 0.0]], [[0.1]], [1.0, 0.0], np.zeros((2, 2)),
-        steps=STEPS, observed=RECORD,
-    )  # fmt: skip
-    terms = psf.log_likelihood(system, psf.EKF(), {}, RECORD, steps=STEPS)
-    np.testing.assert_allclose(terms, true, rtol=1e-10)
-    # Before the first transition every member sits on the mean: the first term is exact.
-    terms = psf.log_likelihood(system, psf.PFEnKF(50), {}, RECORD, steps=STEPS)
-    assert terms[0] == pytest.approx(true[0], rel=1e-10)
-    assert np.isfinite(terms).all()
-
-
 def test_general_noise_is_d_gamma_d():
     system = walk(
         observation=lambda x, e: [x[0] * pt.exp(e[0]) + e[1]],
@@ -127,28 +102,6 @@ def test_a_density_of_the_users_own():
     )  # fmt: skip
     (term,) = psf.log_likelihood(system, psf.BootstrapPF(10), POINT | {"b": 0.7}, [1.0], steps=[0])
     assert term == pytest.approx(stats.laplace(0.2, 0.7).logpdf(1.0), rel=1e-12)
-
-
-def test_carried_states_are_not_nudged():
-    """A second state is set once and for all; an update must not touch it, however correlated."""
-
-    def system(carried):
-        return psf.StateSpaceModel(
-            transition=lambda x: [x[0], x[1]],
-            observation=lambda x: [x[0] + 100 * (x[1] - pt.round(x[1]))],
-            observation_noise=[[0.1]],
-            initial_mean=[0.0, 0.0],
-            initial_cov=[[1.0, 0.0], [0.0, 0.0]],
-            states=["place", "branch"],
-            carried=carried,
-        )
-
-    assert compile_system(system(["branch"])).free.tolist() == [0]
-    assert compile_system(system([])).free.tolist() == [0, 1]
-    terms = psf.log_likelihood(system(["branch"]), psf.EnKF(50), {}, [0.3, 0.3], steps=[0, 1])
-    assert np.isfinite(terms).all()
-    with pytest.raises(psf.errors.ModelError, match="branch"):
-        psf.log_likelihood(system(["branch"]), psf.EKF(), {}, [0.3], steps=[0])
 
 
 # Batches
@@ -207,13 +160,6 @@ def test_one_warning_for_collapsed_particles():
     ) as caught:
         psf.log_likelihood(walk(), psf.BootstrapPF(50), POINT, record, steps=STEPS, seed=[1, 2])
     assert len(caught) == 1
-
-
-def test_nothing_is_said_where_nothing_is_wrong():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for filter in (psf.EKF(), psf.EnKF(30), psf.BootstrapPF(50)):
-            psf.log_likelihood(walk(), filter, POINT, RECORD, steps=STEPS)
 
 
 def test_defaults_are_used_and_can_be_overridden():

@@ -65,18 +65,6 @@ def test_moments_are_those_of_the_weighted_particles_and_of_filtered_states(name
     np.testing.assert_allclose(found["sd"], filtered.sd, rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "filter", [psf.EnKF(40_000), psf.BootstrapPF(40_000), psf.PFEnKF(20_000)], ids=repr
-)
-def test_many_particles_have_the_exact_law(filter):
-    # Five standard errors of a mean over some 10 000 effective particles. Kernels make the cloud of
-    # PFEnKF a little too narrow, here by 3 % at most.
-    found = run(filter, at="steps")
-    truth = exact(ROWS["steps"])
-    assert (np.abs(found["mean"] - truth.mean) < 0.05 * truth.sd).all()
-    np.testing.assert_allclose(found["cov"], exact_cov(ROWS["steps"]), rtol=0.1, atol=0.05)
-
-
 def test_weights_are_those_from_before_resampling():
     found = run(MEMBERS["bootstrap"], at="steps")
     # At step 0 the particles are draws of the prior, and weighted by the density of what was seen.
@@ -85,21 +73,6 @@ def test_weights_are_those_from_before_resampling():
     density = np.exp(-0.5 * np.einsum("ia,ab,ib->i", residual, np.linalg.inv(noise), residual))
     np.testing.assert_allclose(found["weights"][0], density / density.sum(), rtol=1e-9)
     np.testing.assert_allclose(found["weights"][1], 1 / 60, rtol=1e-12)  # resampled since
-
-
-def test_grid_filter_and_ekf_agree_on_a_linear_system():
-    def of(filter):
-        return psf.run_filter(
-            FORCED, filter, POINT, FORCED_DATA, steps=STEPS, inputs=FORCE, at="steps"
-        )
-
-    ekf, grid = of(psf.EKF()), of(psf.GridFilter())
-    for name in ("log_likelihood", "mean", "sd", "cov"):
-        np.testing.assert_allclose(grid[name], ekf[name], atol=1e-6)
-    terms = psf.log_likelihood(
-        FORCED, psf.GridFilter(), POINT, FORCED_DATA, steps=STEPS, inputs=FORCE
-    )
-    np.testing.assert_array_equal(grid["log_likelihood"], terms)
 
 
 def test_coordinates_are_times():

@@ -90,13 +90,6 @@ def test_resampling_at_every_observation_holds_for_equal_weights_too():
     assert always[0][1] != never[0][1]
 
 
-def test_settings():
-    assert BootstrapPF(10, resample_below=1) == BootstrapPF(10, resample_below=1.0)
-    assert BootstrapPF(10) != BootstrapPF(10, resampling="multinomial")
-    assert BootstrapPF.noisy
-    assert BootstrapPF.unbiased
-
-
 def test_stored_normals_serve_multinomial_resampling_too():
     filter_ = BootstrapPF(50, resampling="multinomial", resample_below=1)
     stored = stored_noise(filter_, *LINE[:2], 7)

@@ -5,7 +5,7 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from pymc_statespace_filters.filters.enkf import EnKF
+from pymc_statespace_filters.filters import BootstrapPF, EnKF, PFEnKF
 from pymc_statespace_filters.filters.outcomes import NONE, SINGULAR
 from tests.filters.ensemble_contract import (
     LINE,
@@ -110,6 +110,8 @@ def test_settings_are_frozen_comparable_and_normalised():
         EnKF(10, "gaussian")
     assert EnKF.noisy
     assert not EnKF.unbiased
+    assert not PFEnKF.unbiased
+    assert BootstrapPF.unbiased
 
 
 @pytest.mark.parametrize("n_members", [2, 3])

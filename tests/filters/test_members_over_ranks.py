@@ -217,11 +217,6 @@ def test_every_rank_has_the_numbers_of_one(record, numbers, filter_):
     assert health[1] == NONE
 
 
-def test_one_seed_is_not_another():
-    a, b = (everywhere(EnKF(N), *OSCILLATOR, seed=s, numbers=(2,))[0] for s in (3, 4))
-    assert not np.array_equal(a, b)
-
-
 @pytest.mark.parametrize("filter_", IN_THE_WELL, ids=str)
 def test_ranks_of_whose_members_none_is_alive(filter_):
     """A few members begin between the cliffs, none of them in the first two blocks of five."""
@@ -256,15 +251,6 @@ def test_members_that_explode_on_some_ranks():
     terms, health = everywhere(PFEnKF(N), WELL, *well_record(), theta=WILD_START)
     assert np.all(np.isfinite(terms))
     assert health[1] == NONE
-
-
-@pytest.mark.parametrize("surprise", [4.0, 12.0, 1e3])
-def test_a_surprising_observation(surprise):
-    system, steps, observed = LINE
-    observed = observed.copy()
-    observed[4] += surprise
-    terms, _ = everywhere(PFEnKF(N), system, steps, observed)
-    assert terms[4] < -surprise
 
 
 def test_all_weight_on_one_particle_falls_back_to_bootstrap_weights():

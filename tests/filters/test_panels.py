@@ -19,7 +19,6 @@ from pymc_statespace_filters.filters.outcomes import (
     PROCESS_NOISE,
     STATE_NOT_FINITE,
 )
-from pymc_statespace_filters.filters.protocol import BatchFilter
 from pymc_statespace_filters.filters.signatures import PANEL
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import (
@@ -28,7 +27,6 @@ from pymc_statespace_filters.ops.likelihood import (
     TapedLogLikelihood,
     TapePullback,
 )
-from tests.systems import PAIR, pair_terms
 
 T0, SEED = np.array(0.5), np.array(0)
 
@@ -142,17 +140,6 @@ def test_records_of_unequal_lengths_are_those_alone(n, own_inputs):
     np.testing.assert_array_equal(health, [np.inf, NONE, -1.0])
 
 
-def test_terms_are_those_of_kalman_filters():
-    rng = np.random.default_rng(3)
-    theta = np.column_stack([rng.uniform(-0.9, 0.9, 9), rng.normal(size=9)])
-    panel = table([5, 2, 7, 1, 4, 4, 4, 3, 6], rng, p=2)
-    rows, observed = panel[:2]
-    terms, _ = evaluator(LogLikelihood(PAIR, psf.EKF(), PANEL))(theta, *panel)
-    for (a, b), part in zip(theta, records_of(rows), strict=True):
-        exact = pair_terms(a, b, observed[part], rows[part, 1])
-        np.testing.assert_allclose(terms[part], exact, rtol=1e-11, atol=1e-12)
-
-
 @pytest.mark.parametrize("filter", [psf.UKF(), psf.IPLF()], ids=["UKF", "IPLF"])
 def test_long_gaps_and_a_record_that_ends_before_it_would_explode(filter):
     """The tape has no state for most steps of a gap; an infinite state comes after the last row."""
@@ -259,8 +246,3 @@ def test_systems_too_large_for_lanes_have_the_bits_of_single_records(monkeypatch
     value = evaluator(LogLikelihood(system, psf.EKF(), PANEL))(theta, *panel)
     for found, taped in zip(value, (terms, health), strict=True):
         np.testing.assert_array_equal(found, taped)
-
-
-@pytest.mark.parametrize("filter", [psf.EKF(), psf.UKF(), psf.IPLF()])
-def test_the_gaussian_filters_take_panels(filter):
-    assert isinstance(filter, BatchFilter)

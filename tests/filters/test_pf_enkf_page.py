@@ -141,10 +141,3 @@ def test_total_degeneracy_goes_on_with_bootstrap_weights():
     assert np.all(np.isfinite(terms))
     assert 1 <= health[0] < 20
     assert health[1] == 0
-
-
-def test_settings():
-    assert PFEnKF(10) == PFEnKF(10, likelihood="predictive")
-    assert PFEnKF(10) != PFEnKF(10, likelihood="weights")
-    assert PFEnKF.noisy
-    assert not PFEnKF.unbiased

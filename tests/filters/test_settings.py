@@ -157,27 +157,3 @@ def test_nothing_to_nudge_is_a_bootstrap_filter():
     nudged = psf.log_likelihood(memory, psf.PFEnKF(64), {}, **record)
     plain = psf.log_likelihood(memory, psf.BootstrapPF(64), {}, **record)
     np.testing.assert_array_equal(nudged, plain)
-
-
-@pytest.mark.parametrize(
-    "filter", [psf.EnKF(4000, likelihood="gaussian"), psf.BootstrapPF(4000)], ids=["EnKF", "PF"]
-)
-def test_inputs_hold_during_their_own_step(filter):
-    """Inputs that change at every step by much more than the noise: one row off would show."""
-    driven = psf.StateSpaceModel(
-        lambda x, q, u: [0.5 * x[0] + u[0] + 0.1 * q[0]],
-        lambda x: [x[0]],
-        process_noise=[[1.0]],
-        observation_noise=[[0.1]],
-        initial_mean=[0.0],
-        initial_cov=[[0.1]],
-        inputs=["u"],
-    )
-    inputs = np.array([3.0, -2.0, 5.0, 1.0, -4.0])
-    path = [0.0]
-    for u in inputs:
-        path.append(0.5 * path[-1] + u)
-    record = {"observed": path[1:], "steps": range(1, 6), "inputs": inputs}
-    exact = psf.log_likelihood(driven, psf.EKF(), {}, **record)
-    terms = psf.log_likelihood(driven, filter, {}, **record)
-    np.testing.assert_allclose(terms, exact, atol=0.15)

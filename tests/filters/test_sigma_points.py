@@ -37,7 +37,6 @@ from tests.filters.test_ekf_states import (
     SYSTEM,
     T0,
     States,
-    assert_drawn_from,
     exact,
     process_cov,
 )
@@ -146,16 +145,6 @@ def test_states_of_a_linear_system_are_exact(states, filter, moment, params):
     found, truth = states(filter, moment, params), exact(moment, params)
     np.testing.assert_allclose(found.mean, truth.mean, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(found.sd**2, truth.sd**2, rtol=0.0, atol=1e-9)
-
-
-@LINEAR
-def test_smoothed_draws_are_paths_of_the_joint_law(states, params):
-    """Two tests that each fail a right one once in 1e4, twice."""
-    rows = [0, 1, 5, 7, 10, 13]
-    paths = [states(psf.UKF(), "smoothed", params, i).drawn[rows] for i in range(4000)]
-    truth = exact("smoothed", params, rows=rows)
-    cov = truth.cov.reshape(12, 12)
-    assert_drawn_from(np.reshape(paths, (4000, 12)), truth.mean.ravel(), cov, 1e-4)
 
 
 def see(x, b, push):

@@ -102,9 +102,12 @@ def check_mean_likelihood(filter, exact, n_seeds, **others):
     return ratios
 
 
-@pytest.mark.parametrize("n_particles", [2, 8])
-def test_the_mean_likelihood_of_particles_is_exact(n_particles):
-    ratios = check_mean_likelihood(psf.RBPF(n_particles), exact_log_likelihood(), 4000)
+@pytest.mark.parametrize(
+    ("n_particles", "resampling"), [(2, "sorted"), (4, "multinomial"), (8, "systematic")]
+)
+def test_the_mean_likelihood_of_particles_is_exact(n_particles, resampling):
+    filter = psf.RBPF(n_particles, resampling=resampling, resample_below=0.9)
+    ratios = check_mean_likelihood(filter, exact_log_likelihood(), 4000)
     assert ratios.std() > 0.05  # it is an estimate
 
 
@@ -114,14 +117,6 @@ def test_the_mean_likelihood_of_particles_is_exact_where_the_sensor_switches():
     record = {"steps": np.array([1]), "observed": np.array([[1.9]])}
     exact = log_likelihood(psf.IMM(), system, **record)
     check_mean_likelihood(psf.RBPF(4), exact, 4000, system=system, **record)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("resampling", ["systematic", "multinomial", "sorted"])
-@pytest.mark.parametrize("n_particles", [2, 4, 8])
-def test_the_mean_likelihood_over_many_seeds_is_exact(n_particles, resampling):
-    filter = psf.RBPF(n_particles, resampling=resampling, resample_below=0.9)
-    check_mean_likelihood(filter, exact_log_likelihood(), 20_000)
 
 
 def test_merged_regimes_are_nearly_exact():

@@ -132,15 +132,6 @@ def test_gradient_of_a_batch():
     np.testing.assert_allclose(function(POINTS[:3]), want, rtol=1e-12)
 
 
-def test_arrays_of_parameters_without_pymc():
-    values = {"a": POINTS[:6, 0].reshape(3, 2), "b": 0.1}
-    got = psf.log_likelihood(PAIR, psf.EKF(), values, PAIR_DATA, steps=STEPS, seed=[1, 2])
-    for index in np.ndindex(3, 2):
-        one = {"a": values["a"][index], "b": 0.1}
-        alone = psf.log_likelihood(PAIR, psf.EKF(), one, PAIR_DATA, steps=STEPS)
-        np.testing.assert_allclose(got[index], alone, rtol=1e-12)
-
-
 @pytest.mark.usefixtures("interpreted")
 def test_log_density_of_a_batch_of_parameters_in_pymc():
     thetas = pt.dmatrix("thetas")

@@ -122,12 +122,6 @@ def test_a_panel_with_a_record_that_fails_touches_no_other():
     assert_same(found, alone(op.gradient(), points, PANEL, bars))
 
 
-def test_points_that_all_fail_have_gradients_of_zero():
-    op = LogLikelihood(PAIR, psf.EKF()).gradient()
-    (theta_bar,) = gradients(op, np.tile(FAILS, (3, 1)), *lead(RECORD), BARS[:3])
-    np.testing.assert_array_equal(theta_bar, np.zeros((3, 2)))
-
-
 def test_several_leading_dimensions_and_a_cotangent_for_each_term():
     op = LogLikelihood(PAIR, psf.EKF())
     wanted = alone(op, POINTS, RECORD)

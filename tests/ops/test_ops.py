@@ -9,7 +9,6 @@ import pytensor.tensor as pt
 import pytest
 from pytensor.compile.mode import Mode
 from pytensor.graph.traversal import ancestors
-from pytensor.tensor.blockwise import Blockwise
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
@@ -119,13 +118,6 @@ def test_filters_and_their_settings_have_machine_code_of_their_own():
 # Values.
 
 
-def test_value_is_exact_where_the_filter_is():
-    terms, health = evaluator(LogLikelihood(PAIR, psf.EKF()))(*inputs())
-    np.testing.assert_allclose(terms, pair_terms(0.6), rtol=1e-12)
-    assert terms[2] == 0.0
-    np.testing.assert_array_equal(health[1:], [0, -1])
-
-
 @pytest.mark.parametrize(
     "mode",
     ["FAST_COMPILE", Mode(linker="vm"), Mode(linker="py")],
@@ -141,14 +133,6 @@ def test_other_modes_give_the_same_bits(filter, mode):
         np.testing.assert_array_equal(a, b)
 
 
-def test_gradient_in_other_modes():
-    theta = pt.dvector("theta")
-    gradient = pt.grad(terms_of(psf.EKF(), theta).sum(), theta)
-    numba = pytensor.function([theta], gradient)(THETA)
-    plain = pytensor.function([theta], gradient, mode="FAST_COMPILE")(THETA)
-    np.testing.assert_array_equal(numba, plain)
-
-
 def test_evaluation_is_pure():
     """Equal inputs, equal outputs, whatever came between; inputs are only read."""
     evaluate = evaluator(LogLikelihood(PAIR, PF))
@@ -162,11 +146,6 @@ def test_evaluation_is_pure():
     np.testing.assert_array_equal(first, again)
     np.testing.assert_array_equal(health, health_again)
     assert np.abs(first - other_seed)[[0, 1, 3]].min() > 1e-6
-
-
-def test_ekf_ignores_the_seed():
-    evaluate = evaluator(LogLikelihood(PAIR, psf.EKF()))
-    np.testing.assert_array_equal(evaluate(*inputs(seed=1))[0], evaluate(*inputs(seed=2))[0])
 
 
 def test_memory_layout_of_data_does_not_matter():
@@ -187,27 +166,7 @@ def test_shapes_are_known_without_evaluating():
     assert [int(n) for n in function(THETA)] == [4, 3, 2]
 
 
-def test_batch_equals_loop():
-    theta, seed = pt.dmatrix("theta"), pt.lvector("seed")
-    fixed = inputs()[1:-1]
-    terms, _ = Blockwise(LogLikelihood(PAIR, PF))(theta, *fixed, seed)
-    thetas, seeds = np.array([[0.6, 0.2], [0.1, 0.2], [0.9, -0.3]]), np.array([1, 2, 2])
-    batch = pytensor.function([theta, seed], terms)(thetas, seeds)
-    evaluate = evaluator(LogLikelihood(PAIR, PF))
-    loop = [evaluate(*inputs(t, seed=s))[0] for t, s in zip(thetas, seeds, strict=True)]
-    np.testing.assert_array_equal(batch, loop)
-
-
 # Gradients.
-
-
-def test_gradient_agrees_with_finite_differences():
-    def log_likelihood(theta):
-        weights = np.array([1.0, -2.0, 0.5, 3.0])  # tells apart which term a cotangent meets
-        return (terms_of(psf.EKF(), theta) * weights).sum()
-
-    rng = np.random.default_rng(1)
-    pytensor.gradient.verify_grad(log_likelihood, [THETA], rng=rng, mode=Mode(linker="py"))
 
 
 def test_gradient_agrees_with_central_differences_of_the_exact_likelihood():
@@ -218,16 +177,6 @@ def test_gradient_agrees_with_central_differences_of_the_exact_likelihood():
     for i, step in enumerate(np.eye(2) * h):
         up, down = pair_terms(*(THETA + step)).sum(), pair_terms(*(THETA - step)).sum()
         np.testing.assert_allclose(gradient(THETA)[i], (up - down) / (2 * h), rtol=1e-6)
-
-
-def test_gradient_stays_finite_where_the_filter_fails():
-    theta = pt.dvector("theta")
-    terms = terms_of(psf.EKF(), theta)
-    both = [terms, pt.grad(terms.sum(), theta)]
-    function = pytensor.function([theta], both, mode=Mode(linker="py"))
-    values, gradient = function(np.array([1e300, 0.2]))
-    assert values[-1] == -np.inf
-    assert np.isfinite(gradient).all()
 
 
 def test_gradient_of_the_health_alone_is_zero():
