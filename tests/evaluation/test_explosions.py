@@ -1,15 +1,11 @@
 """Parameters that make the system explode give -inf and a reason, never NaN and never a crash."""
 
-import re
-import warnings
-
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.filters.outcomes import Failure
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihoodGradient
 from pymc_statespace_filters.system.parameters import flat_parameters
@@ -17,52 +13,8 @@ from tests.systems import DOUBLE_WELL_SYSTEM
 
 STEPS = [0, 10, 20, 40]
 RECORD = [1.0, -0.5, np.nan, 0.8]
-FILTERS = [psf.EKF(), psf.EnKF(50), psf.BootstrapPF(50), psf.PFEnKF(50)]
-
-
 PARAMETERS = ("alpha", "beta", "sigma", "initial_var")
 KNOWN = {"noise_var": 0.08, "initial_mean": 1.0}
-
-
-def evaluate(filter, points):
-    """Terms (S, J), and the reasons that the warnings count."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        terms = psf.log_likelihood(DOUBLE_WELL_SYSTEM, filter, points | KNOWN, RECORD, steps=STEPS)
-    assert all(issubclass(w.category, psf.errors.FilterWarning) for w in caught)
-    counted = sum(
-        int(count)
-        for w in caught
-        for count in re.findall(r"gave -inf in (\d+) of", str(w.message))
-        if any(failure.message in str(w.message) for failure in Failure)
-    )
-    return terms, counted
-
-
-@pytest.mark.parametrize("filter", FILTERS, ids=lambda f: type(f).__name__)
-def test_no_point_gives_nan(filter):
-    """The four named points and 10 000 random ones, over many orders of magnitude."""
-    rng, n = np.random.default_rng(13), 10_000
-    alpha, beta = (rng.choice([-1, 1], n) * 10 ** rng.uniform(-2, 6, n) for _ in range(2))
-    sigma, spread = 10 ** rng.uniform(-6, 4, n), 10 ** rng.uniform(-8, 4, n)
-    named = np.array([
-        [1e6, -1.0, 0.5, 0.5], [4.0, -4.0, 0.0, 0.5], [4.0, 100.0, 0.5, 0.5], [4.0, -4.0, 0.5, 0.0],
-        [4.0, -4.0, 0.0, 0.0], [1e308, 1e308, 1e308, 1e308], [np.inf, 0.0, 1.0, 1.0],
-        [4.0, -4.0, 0.5, -1.0],
-    ])  # fmt: skip
-    points = np.vstack([named, np.column_stack([alpha, beta, sigma, spread])])
-    terms, counted = evaluate(filter, dict(zip(PARAMETERS, points.T, strict=True)))
-    total = terms.sum(axis=1)
-    assert not np.isnan(terms).any()
-    assert not (terms == np.inf).any()
-    failed = total == -np.inf
-    assert counted == failed.sum()
-    # harmless points have a value, hopeless ones have none
-    assert np.isfinite(total[[1, 3, 4]]).all()
-    assert failed[[5, 6, 7]].all()
-    assert 0.05 < failed.mean() < 0.95
-    # from the failing observation on, every term is -inf
-    assert (np.diff(np.isinf(terms[failed]).astype(int), axis=1) >= 0).all()
 
 
 def test_the_gradient_of_an_explosion_is_finite():
@@ -113,7 +65,9 @@ def test_a_covariance_that_no_observation_depends_on_must_exist(filter):
         np.testing.assert_array_equal(failed == -np.inf, [False, False, True])
 
 
-@pytest.mark.parametrize("filter", FILTERS[1:3], ids=lambda f: type(f).__name__)
+@pytest.mark.parametrize(
+    "filter", [psf.EnKF(50), psf.BootstrapPF(50)], ids=lambda f: type(f).__name__
+)
 def test_a_singular_matrix_in_a_users_function_is_minus_infinity(filter):
     system = psf.StateSpaceModel(
         transition=lambda x, k: pt.linalg.inv(pt.stack([[k]])) @ x,

@@ -1,7 +1,5 @@
 """The point-mass filter against exact answers: Kalman's, and sums on grids of the tests' own."""
 
-import warnings
-
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
@@ -264,29 +262,6 @@ def test_mass_that_explodes_is_left_out():
         record["steps"],
     )
     np.testing.assert_allclose(terms, exact, rtol=0.0, atol=1e-6)
-
-
-def test_no_point_gives_nan():
-    """Parameters over many orders of magnitude."""
-    rng, n = np.random.default_rng(13), 40
-    names = ("alpha", "beta", "sigma", "initial_var")
-    sizes = 10 ** rng.uniform([-2, -2, -6, -8], [6, 6, 4, 4], (n, 4))
-    sizes[:, :2] *= rng.choice([-1, 1], (n, 2))
-    parameters = double_well_parameters(DOUBLE_WELL) | dict(zip(names, sizes.T, strict=True))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", psf.errors.FilterWarning)
-        terms = psf.log_likelihood(
-            DOUBLE_WELL_SYSTEM,
-            psf.GridFilter(),
-            parameters,
-            [1.0, -0.5, np.nan, 0.8],
-            steps=[0, 10, 20, 40],
-        )
-    assert not np.isnan(terms).any()
-    assert not (terms == np.inf).any()
-    failed = np.isinf(terms.sum(axis=1))
-    assert 0.05 < failed.mean() < 0.95
-    assert (np.diff(np.isinf(terms[failed]).astype(int), axis=1) >= 0).all()
 
 
 def refused(**changes):
