@@ -1,33 +1,24 @@
 """Plot of a model average beside the individual models (thesis, Figs. 15, 19 and 23)."""
 
-import math
 from collections.abc import Hashable
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from arviz_base import rcParams
-from arviz_base.labels import NoVarLabeller
 from arviz_plots import PlotCollection
-from arviz_plots.visuals import labelled_title, labelled_x, labelled_y, line_xy
+from arviz_plots.visuals import line_xy
 
 from ..errors import ModelError
-from .canvas import (
-    BOUND,
-    band,
-    canvas,
-    curve,
-    format_probability,
-    size_of_panels,
-    style_of_curve,
-    with_unit,
-)
-from .legend import add_legend
+from .picture import Mark, along_models, picture, style_of_curve, titles_of, with_unit
+from .rows import format_probability
+from .shapes import BOUND, band, curve
 
 AVERAGE = "average"
-AES = ["color", "linestyle", "width"]
 N_GRID = 512
-ENDS = {"width": 1.5, "linestyle": "C1"}  # of the interval of the average
+BOLD = {"color": "B1", "linestyle": "C0", "width": 4}
+ENDS = {"color": "B1", "linestyle": "C1", "width": 1.5}  # of the interval of the average
+SIZE, SIZE_ALONE, PANELS_IN_LINE = (3.8, 2.8), (6.0, 3.0), 4  # inches of a panel
 PROB_SHOWN = 1e-3  # models above this probability determine the x range of densities
 
 
@@ -94,37 +85,29 @@ def plot_average(
 
     data = _means(members, mixture) if along else _densities(members)
     panels = [dim for dim in members[name].dims if dim not in ("model", "chain", "draw", *along)]
-    n_members = members.sizes["model"]
-    styles = [style_of_curve(i) for i in range(n_members)]
-    intervals = _legend_of_intervals() if along else {}
-    n_panels = math.prod(members.sizes[dim] for dim in panels)
-    collection = canvas(
+    probs = zip(members["model"].values, members["prob"].values, strict=True)
+    key = {AVERAGE: AVERAGE} | {one: f"{one} ({format_probability(p)})" for one, p in probs}
+    thin = [{**style_of_curve(i), "width": 1.5} for i in range(members.sizes["model"])]
+    quantity = _axis_label(mixture[name])
+    if along:
+        below, above = _intervals(members, mixture)
+        marks = [*below, Mark(curve, "curve", data, {}, key), *above]
+        x, y = _axis_label(mixture[along[0]]), quantity
+    else:
+        marks, x, y = [Mark(line_xy, "density", data, {}, key)], quantity, "density"
+    return picture(
         data,
+        marks,
+        x=x,
+        y=y,
+        title=titles_of(members, panels),
+        cols=panels,
+        size=SIZE if panels else SIZE_ALONE,
+        in_line=PANELS_IN_LINE,
         backend=backend,
         pc_kwargs=pc_kwargs,
-        aes={name: ["model"] for name in AES},
-        size=size_of_panels(n_panels),
-        n_panels=n_panels,
-        key=[*_labels_of_models(members).values(), *intervals],
-        cols=panels,
-        color=["B1", *(style["color"] for style in styles)],
-        linestyle=["C0", *(style["linestyle"] for style in styles)],
-        width=[4, *[1.5] * n_members],
+        aesthetics=along_models([BOLD, *thin]),
     )
-    if panels:
-        collection.map(
-            labelled_title, "title", ignore_aes="all", subset_info=True, labeller=NoVarLabeller()
-        )
-    if along:
-        _draw_curves(collection, members, mixture)
-    else:
-        collection.map(line_xy, "density")
-    quantity = _axis_label(mixture[name])
-    labels = (_axis_label(mixture[along[0]]), quantity) if along else (quantity, "density")
-    collection.map(labelled_x, "x_label", ignore_aes="all", text=labels[0])
-    collection.map(labelled_y, "y_label", ignore_aes="all", text=labels[1])
-    add_legend(collection, _legend_of_models(collection, members) | intervals)
-    return collection
 
 
 def _axis_label(array: xr.DataArray) -> str:
@@ -133,17 +116,21 @@ def _axis_label(array: xr.DataArray) -> str:
     return with_unit(label, array.attrs.get("units"))
 
 
-def _draw_curves(collection: PlotCollection, members: xr.Dataset, mixture: xr.Dataset) -> None:
-    """Draw means, intervals of the models as bands, and that of the average as two lines."""
+def _intervals(members: xr.Dataset, mixture: xr.Dataset) -> tuple[list[Mark], list[Mark]]:
+    """Intervals of the models as bands, and that of the average as two lines, as ArviZ sets them.
+
+    The bands are below the curves, the lines above them.
+    """
     of_members, of_average = (
         getattr(draws.azstats, rcParams["stats.ci_kind"])() for draws in (members, mixture)
     )
-    ignored = {"ignore_aes": {"width", "linestyle"}}
-    collection.map(band, "band", data=of_members, alpha=0.2, **ignored)
-    collection.map(curve, "curve")
-    for end in ("lower", "upper"):
-        ends = of_average.sel({BOUND: end}).expand_dims(model=[AVERAGE])
-        collection.map(curve, end, data=ends, **ENDS, **ignored)
+    kind = "HDI" if rcParams["stats.ci_kind"] == "hdi" else "interval"
+    share = f"{100 * rcParams['stats.ci_prob']:g} % {kind} of"
+    lines = [
+        Mark(curve, end, of_average.sel({BOUND: end}).expand_dims(model=[AVERAGE]), ENDS, key)
+        for end, key in (("lower", f"{share} the average"), ("upper", ""))
+    ]
+    return [Mark(band, "band", of_members, {"alpha": 0.2}, f"{share} a model")], lines
 
 
 def _numeric_dims(array: xr.DataArray) -> list[Hashable]:
@@ -185,27 +172,3 @@ def _densities(members: xr.Dataset) -> xr.Dataset:
     )
     coords = {"plot_axis": ["x", "y"], "model": [AVERAGE, *members["model"].values]}
     return densities.assign_coords(coords).to_dataset(name=kernel_densities.name)
-
-
-def _labels_of_models(members: xr.Dataset) -> dict[str, str]:
-    """Return the entries of the average and of the models, these with their probabilities."""
-    probs = zip(members["model"].values, members["prob"].values, strict=True)
-    return {AVERAGE: AVERAGE} | {name: f"{name} ({format_probability(p)})" for name, p in probs}
-
-
-def _legend_of_models(collection: PlotCollection, members: xr.Dataset) -> dict[str, dict[str, Any]]:
-    """Return the styles of the average and of the models."""
-    return {
-        label: dict(collection.get_aes_kwargs(AES, "mapping", {"model": name}))
-        for name, label in _labels_of_models(members).items()
-    }
-
-
-def _legend_of_intervals() -> dict[str, dict[str, Any]]:
-    """Return the styles of the intervals, whose kind and probability ArviZ sets."""
-    kind = "HDI" if rcParams["stats.ci_kind"] == "hdi" else "interval"
-    share = f"{100 * rcParams['stats.ci_prob']:g} %"
-    return {
-        f"{share} {kind} of the average": {"color": "B1", **ENDS},
-        f"{share} {kind} of a model": {"color": "B3", "alpha": 0.4, "width": 8},
-    }

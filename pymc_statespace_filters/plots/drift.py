@@ -12,10 +12,10 @@ from arviz_plots.visuals import hline
 from ..diagnostics.constancy.table import DriftScan
 from ..errors import ModelError
 from ..former_names import former_names
-from .canvas import band, curve, interval, label_axes, time_label
-from .legend import add_legend, legend_style
-from .marks import canvas_over_time, points
-from .results import select_names
+from .over_time import picture_over_time
+from .picture import Mark
+from .results import select_names, time_label
+from .shapes import band, curve, interval, points
 
 SUM = {"color": "C0", "width": 1.5}
 CONSTANT = {"color": "B3", "alpha": 0.3}
@@ -100,22 +100,22 @@ def plot_drift(
         raise ModelError(f"scan has summed scores of none of {list(scan.index)}: nothing to plot")
     paths = paths.sel(parameter=shown)
     sums = paths[["cumulated"]]
-    collection = canvas_over_time(sums, "parameter", 1, backend=backend, pc_kwargs=pc_kwargs)
     bound = xr.ones_like(sums) * paths["band"]
-    collection.map(band, "constant", data=interval(-bound, bound), **CONSTANT)
-    zeros = xr.zeros_like(sums.isel(time=0, drop=True))
-    collection.map(hline, "zero", data=zeros, **ZERO)
-    collection.map(curve, "sum", data=sums, **SUM)
-    collection.map(points, "turn", data=sums.where(paths["row_number"] == paths["turn"]), **TURN)
-    labels = [f"{name}, p = {scan.loc[name, 'p_value']:.3f}" for name in shown]
-    label_axes(collection, labels, time_label(sums["cumulated"]))
-    legend = {
-        "summed scores (sd)": SUM,
-        "95 % of constant parameters": {**CONSTANT, "width": 8},
-        "time of the change": legend_style({"color": TURN["color"]}),
-    }
-    add_legend(collection, legend)
-    return collection
+    constant = interval(-bound, bound)
+    turns = sums.where(paths["row_number"] == paths["turn"])
+    return picture_over_time(
+        sums,
+        [
+            Mark(band, "constant", constant, CONSTANT, "95 % of constant parameters"),
+            Mark(hline, "zero", xr.zeros_like(sums.isel(time=0, drop=True)), ZERO),
+            Mark(curve, "sum", sums, SUM, "summed scores (sd)"),
+            Mark(points, "turn", turns, TURN, "time of the change"),
+        ],
+        [f"{name}, p = {scan.loc[name, 'p_value']:.3f}" for name in shown],
+        x=time_label(sums["cumulated"]),
+        backend=backend,
+        pc_kwargs=pc_kwargs,
+    )
 
 
 def _of_record(scan: DriftScan, record: Any) -> xr.Dataset:

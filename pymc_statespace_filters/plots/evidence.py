@@ -4,24 +4,21 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import xarray as xr
 from arviz_plots import PlotCollection
-from arviz_plots.plot_collection import backend_from_object
-from arviz_plots.visuals import labelled_x, line_x, scatter_x, set_xlim, set_xticks
+from arviz_plots.visuals import line_x, scatter_x, set_xlim
 
 from ..errors import ModelError
 from ..evidence import Evidence
 from ..system.checks import shortened
-from .canvas import annotate, canvas_of_rows, format_probability, interval, linear_ticks
-from .legend import add_legend, legend_style
-
-N_TICKS = 5  # numbers of many digits beside each other
+from .picture import Mark
+from .rows import decimals, ends, format_probability, picture_of_rows
+from .shapes import interval
 
 COLUMNS = ("prob", "prob_low", "prob_high", "undecided")
 STYLE = {"color": "C0"}
-END = 0.12  # half the length of the mark at an end of an interval
+OPEN = {"facecolor": "B0", "edgecolor": "C0", "width": 1.5}
 
 
 def plot_evidence(
@@ -64,22 +61,23 @@ def plot_evidence(
     >>> collection.savefig("evidence.png")  # doctest: +SKIP
     """
     table = _table(idata_or_table)
-    points = table[["log_evidence"]]
-    collection = canvas_of_rows(points, backend=backend, pc_kwargs=pc_kwargs)
-    for label, n_errors, width in (("two_se", 2, 1.5), ("one_se", 1, 4)):
-        bars = interval(points - n_errors * table["se"], points + n_errors * table["se"])
-        collection.map(line_x, label, data=bars, width=width, color="C0")
-    collection.map(scatter_x, "point", color="C0")
-    values = table["log_evidence"]
-    texts = xr.apply_ufunc(_text, values, table["se"], vectorize=True, output_dtypes=[object])
-    middle = (values.min() + values.max()).item() / 2
-    collection.map(annotate, "text", texts=texts, middle=middle, color="B2")
-    ends = [(values + sign * 2 * table["se"].fillna(0.0)).values for sign in (-1, 1)]
-    ticks = linear_ticks(np.min(ends), np.max(ends), N_TICKS)
-    collection.map(set_xticks, ignore_aes="all", store_artist=False, **ticks)
-    text = "log-evidence (nats), 1 and 2 standard errors"
-    collection.map(labelled_x, "x_label", ignore_aes="all", text=text)
-    return collection
+    points, values = table[["log_evidence"]], table["log_evidence"]
+    bars = [
+        interval(points - count * table["se"], points + count * table["se"]) for count in (2, 1)
+    ]
+    return picture_of_rows(
+        points,
+        [
+            Mark(line_x, "two_se", bars[0], {"width": 1.5, **STYLE}),
+            Mark(line_x, "one_se", bars[1], {"width": 4, **STYLE}),
+            Mark(scatter_x, "point", points, STYLE),
+        ],
+        xr.apply_ufunc(_text, values, table["se"], vectorize=True, output_dtypes=[object]),
+        middle=(values.min() + values.max()).item() / 2,
+        x="log-evidence (nats), 1 and 2 standard errors",
+        backend=backend,
+        pc_kwargs=pc_kwargs,
+    )
 
 
 def _table(given: xr.DataTree | pd.DataFrame | Mapping[str, Evidence]) -> xr.Dataset:
@@ -107,8 +105,7 @@ def _table(given: xr.DataTree | pd.DataFrame | Mapping[str, Evidence]) -> xr.Dat
 def _text(log_evidence: float, se: float) -> str:
     if math.isnan(se):
         return f"{log_evidence:.2f}"
-    digits = min(max(2, math.ceil(-math.log10(se))), 4) if se > 0 else 2  # none is "0.00"
-    return f"{log_evidence:.{digits}f} ± {se:.{digits}f}"
+    return f"{log_evidence:.{decimals(se)}f} ± {se:.{decimals(se)}f}"
 
 
 def plot_model_probabilities(
@@ -154,46 +151,28 @@ def plot_model_probabilities(
         raise ModelError(f"table must be one of compare_evidence, got {shortened(table)}")
     data = table.rename_axis("model")[list(COLUMNS)].to_xarray()
     prob, undecided = data[["prob"]], data["undecided"]
-    low, high = (data[[end]].rename({end: "prob"}) for end in ("prob_low", "prob_high"))
-
-    collection = canvas_of_rows(prob, backend=backend, pc_kwargs=pc_kwargs)
-    bounds = interval(low, high)
-    collection.map(line_x, "interval", data=bounds, width=2, **STYLE)
-    collection.map(scatter_x, "decided", data=prob.where(~undecided), **STYLE)
-    collection.map(
-        scatter_x,
-        "undecided",
-        data=prob.where(undecided),
-        facecolor="B0",
-        edgecolor="C0",
-        width=1.5,
-    )
-    collection.map(ends, "ends", data=bounds, width=2, **STYLE)
+    bounds = interval(*(data[[end]].rename({end: "prob"}) for end in ("prob_low", "prob_high")))
+    bar = {**STYLE, "width": 2}
     texts = xr.apply_ufunc(
         _shown_probability,
         *(data[column] for column in COLUMNS),
         vectorize=True,
         output_dtypes=[object],
     )
-    collection.map(annotate, "text", texts=texts, middle=0.5, color="B2")
-    collection.map(set_xlim, ignore_aes="all", limits=(-0.02, 1.02), store_artist=False)
-    collection.map(labelled_x, "x_label", ignore_aes="all", text="probability of the model")
-    legend = {"probability": legend_style(STYLE)}
-    if bounds["prob"].notnull().any():
-        legend["interval of the evidences' errors"] = {**STYLE, "width": 2}
-    add_legend(collection, legend)
-    return collection
-
-
-def ends(da: xr.DataArray, target: Any, *, y: Any, **kwargs: Any) -> Any:
-    """Mark the ends of an interval by vertical lines that are longer than a point."""
-    row = np.asarray(y).item()
-    low, high = da.values
-    return backend_from_object(target).line(
-        [low, low, np.nan, high, high],
-        [row - END, row + END, np.nan, row - END, row + END],
-        target,
-        **kwargs,
+    return picture_of_rows(
+        prob,
+        [
+            Mark(line_x, "interval", bounds, bar, "interval of the evidences' errors"),
+            Mark(scatter_x, "decided", prob.where(~undecided), STYLE, "probability"),
+            Mark(scatter_x, "undecided", prob.where(undecided), OPEN, "probability"),
+            Mark(ends, "ends", bounds, bar),
+            Mark(set_xlim, None, prob, {"limits": (-0.02, 1.02)}),
+        ],
+        texts,
+        middle=0.5,
+        x="probability of the model",
+        backend=backend,
+        pc_kwargs=pc_kwargs,
     )
 
 
@@ -201,14 +180,6 @@ def _shown_probability(prob: float, low: float, high: float, undecided: bool) ->
     """Write a probability, its interval unless that has no width, and whether it is undecided."""
     text = format_probability(prob)
     if math.isfinite(high - low) and high > low:
-        digits = min(max(2, math.ceil(-math.log10(high - low)) + 1), 4)
-        text, *bounds = (_with_digits(value, digits) for value in (prob, low, high))
+        text, *bounds = (format_probability(p, (high - low) / 10) for p in (prob, low, high))
         text = f"{text} ({' to '.join(bounds)})"
     return text + (", undecided" if undecided else "")
-
-
-def _with_digits(prob: float, digits: int) -> str:
-    """Write a probability with so many decimals, or more near zero and one."""
-    if 1e-6 <= prob < 0.01:
-        return f"{prob:.2g}"
-    return f"{prob:.{digits}f}" if 0.01 <= prob < 0.99 else format_probability(prob)

@@ -5,10 +5,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from arviz_base.labels import NoVarLabeller
 from arviz_plots import PlotCollection
-from arviz_plots.visuals import hline, labelled_title, labelled_x, labelled_y
-from arviz_stats.base import array_stats
+from arviz_plots.visuals import hline, hspan
 from arviz_stats.ecdf_utils import (
     compute_ecdf,
     get_pointwise_confidence_band,
@@ -17,32 +15,37 @@ from arviz_stats.ecdf_utils import (
 from scipy.stats import norm
 
 from ..former_names import former_names
-from .canvas import (
-    PANELS_IN_LINE,
+from .over_time import bands_of, median_of, over_draws
+from .picture import Mark, picture, titles_of
+from .results import diagnostics_of, time_label
+from .shapes import (
     band,
-    canvas,
+    bars,
     curve,
+    from_zero,
     interval,
-    label_ticks,
     logarithmic_ticks,
-    shorten_dates,
-    time_label,
+    point_size,
+    points,
+    y_ticks,
 )
-from .legend import add_legend, legend_style
-from .marks import bars, draw_bands, draw_median, over_draws, point_size, points
-from .panels import one_record
-from .results import group_of, rename_last_dims, seen_observables, variable_of
 
 COLLAPSED = 3  # effective particles below which a filter counts as collapsed
 PROB, TAIL = 0.95, 1.96  # of the bands expected of a calibrated filter
-MAX_LAG = 25
 PIT_GRID = np.linspace(0, 1, 101)
 N_SIMULATIONS = 1000  # of uniform numbers, for the simultaneous band of their ECDF
 SEEN = {"color": "C0"}
 EXPECTED = {"color": "B3", "alpha": 0.3}
-CORRELATIONS = {"autocorrelation", "inputs"}  # drawn as bars over lags
-CUT = {"color": "C1", "marker": "C3"}
+CUT = {"color": "C1", "marker": "C3", "diameter": 6}
 LIMIT = {"color": "B1", "linestyle": "C1"}
+SIZE, PANELS_IN_LINE = (3.8, 2.6), 4  # inches of a panel
+AXES = {
+    "residual": ("time", "standardised residual"),
+    "autocorrelation": ("lag (observations)", "autocorrelation"),
+    "pit": ("PIT: probability of less", "share below − expected"),
+    "inputs": ("lag (observations)", "correlation with inputs"),
+    "effective": ("time", "effective number"),
+}
 
 
 @former_names
@@ -61,7 +64,8 @@ def plot_filter_health(
     * the standardised residuals of one-step-ahead prediction over time. Many residuals outside the
       band, or long runs of one sign, show when the model is wrong. A residual that is further out
       than the draws can tell is crossed out;
-    * their autocorrelation: white noise stays within :math:`\pm 1.96 / \sqrt{J}`;
+    * the autocorrelation of the innovations: white noise stays within
+      :math:`\pm 1.96 / \sqrt{J}`;
     * the empirical distribution function of the probability integral transform (PIT) minus that of
       a uniform distribution, with a simultaneous band [1]_. Predictions that are too wide go below
       and then above the band, those that are too narrow the other way round; a bias lies on one
@@ -128,111 +132,69 @@ def plot_filter_health(
     >>> collection = plot_filter_health(idata)
     >>> collection.savefig("health.png")  # doctest: +SKIP
     """
-    _, results = group_of(idata, "filter_diagnostics")
-    name = variable_of(results, var_name, "_residual")
-    idata = one_record(idata, "filter_diagnostics", name, record)
-    results = idata["filter_diagnostics"].to_dataset()
-    seen_ones = seen_observables(results[f"{name}_residual"])
-    n_observables = seen_ones.size
-    results = results.isel({results[f"{name}_residual"].dims[-1]: seen_ones})
-    residual, pit = (
-        rename_last_dims(results[f"{name}_{kind}"], "time", "observable")
-        for kind in ("residual", "pit")
-    )
-    panels = [_residuals(residual), _autocorrelations(residual), _pits(pit)]
-    if f"{name}_input_correlation" in results:
-        panels.append(_input_correlations(results, name, residual))
-    panels = [panel for panel in panels if panel[0].to_array().notnull().any()]
-    seen, expected = (xr.merge(parts) for parts in zip(*panels, strict=True))
-    effective = _log_effective(results, name)
-    data = seen if effective is None else seen.assign(effective=effective)
-
+    found, _ = diagnostics_of(idata, "residual", var_name, record)
+    residual = found["residual"]
+    chance = residual.count("time") ** -0.5
+    panels, bounds = {"residual": residual}, {"residual": 0.0 * chance + TAIL}
+    if "autocorrelation" in found:
+        panels["autocorrelation"], bounds["autocorrelation"] = (
+            found["autocorrelation"],
+            TAIL * chance,
+        )
+    pit, pit_bounds = _pit(found["pit"])
+    panels["pit"] = pit["pit"]
+    if "input_correlation" in found and found["input_correlation"].notnull().any():
+        panels["inputs"], largest = _largest(found["input_correlation"])
+        bounds["inputs"] = largest * chance
+    shown, limits = xr.Dataset(panels), xr.Dataset(bounds)
+    lags = shown.drop_vars(["residual", "pit"])
+    key = "95 % if calibrated"
+    marks = [
+        Mark(hspan, "expected", interval(-limits, limits), EXPECTED, key),
+        Mark(band, "expected", pit_bounds, EXPECTED),
+        Mark(points, "seen", shown[["residual"]], {**SEEN, **point_size(residual)}),
+        Mark(bars, "seen", from_zero(lags), {**SEEN, "width": 2}),
+        Mark(curve, "seen", pit, {**SEEN, "width": 1.5}),
+    ]
+    if "clipped" in found:
+        marks.append(
+            Mark(points, "clipped", shown[["residual"]].where(found["clipped"]), CUT, "further out")
+        )
     n_columns = residual.sizes["observable"]
-    n_panels = len(panels) * n_columns + (effective is not None)
-    in_line = 2 if n_columns == 1 else min(n_columns, PANELS_IN_LINE)
-    collection = canvas(
-        data,
+    title = dict.fromkeys(
+        map(str, shown), titles_of(shown, ["observable"]) if n_columns > 1 else ""
+    )
+    if "n_effective" in found and np.isfinite(found["n_effective"]).any():
+        logs, of_effective = _effective(found)
+        shown, marks = shown.assign(logs), marks + of_effective
+        title["effective"] = _failures(idata)
+    time = time_label(residual)
+    return picture(
+        shown,
+        marks,
+        x={name: time if label == "time" else label for name, (label, _) in AXES.items()},
+        y={name: label for name, (_, label) in AXES.items()},
+        title=title,
+        cols=["__variable__", "observable"],
+        size=SIZE,
+        in_line=2 if n_columns == 1 else min(n_columns, PANELS_IN_LINE),
         backend=backend,
         pc_kwargs=pc_kwargs,
-        aes={},
-        size=(3.8 * in_line, 0.6 + 2.6 * -(-n_panels // in_line)),
-        n_panels=n_panels,
-        panels_in_line=in_line,
-        cols=["__variable__", "observable"],
     )
-    collection.map(band, "expected", data=expected, **EXPECTED)
-    size = point_size(residual)
-    collection.map(points, "seen", data=seen[["residual"]], **size, **SEEN)
-    for correlation in CORRELATIONS & set(seen):
-        lags = seen[[correlation]]
-        collection.map(bars, "seen", data=interval(xr.zeros_like(lags), lags), width=2, **SEEN)
-    legend = {"95 % if calibrated": {**EXPECTED, "width": 8}}
-    legend |= _mark_clipped(collection, seen[["residual"]], results.get(f"{name}_clipped"))
-    collection.map(curve, "seen", data=seen[["pit"]], width=1.5, **SEEN)
-    if effective is not None:
-        legend |= _draw_effective(collection, data[["effective"]])
-        _note_failures(collection, data[["effective"]], idata)
-    _label_panels(collection, data, time_label(residual), n_observables)
-    shorten_dates(collection)
-    add_legend(collection, legend)
-    return collection
 
 
-def _residuals(residual: xr.DataArray) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return residuals over time, and the band of a standard normal."""
-    bound = xr.full_like(residual, TAIL).to_dataset(name="residual")
-    return residual.to_dataset(name="residual"), interval(-bound, bound)
+def _largest(correlation: xr.DataArray) -> tuple[xr.DataArray, float]:
+    """Return the correlation with inputs that is furthest from zero at each lag.
 
-
-def _autocorrelations(residual: xr.DataArray) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return autocorrelations of the non-missing residuals, and the band of white noise."""
-    n_lags = max(1, min(MAX_LAG, residual.sizes["time"] // 4))
-
-    def autocorrelation(values: np.ndarray) -> np.ndarray:
-        found = array_stats.autocorr(values[np.isfinite(values)])[1 : n_lags + 1]
-        return np.pad(found, (0, n_lags - found.size), constant_values=np.nan)
-
-    lags = xr.apply_ufunc(
-        autocorrelation,
-        residual,
-        input_core_dims=[["time"]],
-        output_core_dims=[["lag"]],
-        vectorize=True,
-    ).assign_coords(lag=np.arange(1, n_lags + 1))
-    bound = TAIL * residual.count("time") ** -0.5
-    bounds = bound.expand_dims(lag=lags["lag"]).to_dataset(name="autocorrelation")
-    return lags.to_dataset(name="autocorrelation"), interval(-bounds, bounds)
-
-
-def _input_correlations(
-    results: xr.Dataset, name: str, residual: xr.DataArray
-) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return the correlations with the inputs, the largest at each lag, and the band of chance.
-
-    The band is that of the largest of as many correlations as there are inputs.
+    And the bound of the largest of as many standard normals as there are inputs.
     """
-    found = results[f"{name}_input_correlation"]
-    found = found.rename(input_lag="past", **{str(found.dims[-1]): "observable"})
-    n_inputs = found.sizes["input"]
-    place = abs(found).fillna(0.0).argmax("input")
-    largest = found.isel(input=place).drop_vars("input")
-    bound = norm.isf((1 - PROB ** (1 / n_inputs)) / 2) * residual.count("time") ** -0.5
-    bounds = bound.expand_dims(past=largest["past"]).to_dataset(name="inputs")
-    return largest.to_dataset(name="inputs"), interval(-bounds, bounds)
+    place = abs(correlation).fillna(0.0).argmax("input")
+    n_inputs = correlation.sizes["input"]
+    bound = norm.isf((1 - PROB ** (1 / n_inputs)) / 2)
+    return correlation.isel(input=place).drop_vars("input"), bound
 
 
-def _mark_clipped(
-    collection: PlotCollection, residual: xr.Dataset, clipped: xr.DataArray | None
-) -> dict[str, dict[str, Any]]:
-    """Cross out every residual that is cut off; return its legend entry."""
-    if clipped is None or not clipped.any():
-        return {}
-    cut = residual.where(rename_last_dims(clipped, "time", "observable"))
-    collection.map(points, "clipped", data=cut, diameter=6, **CUT)
-    return {"further out": legend_style(CUT)}
-
-
-def _pits(pit: xr.DataArray) -> tuple[xr.Dataset, xr.Dataset]:
+def _pit(pit: xr.DataArray) -> tuple[xr.Dataset, xr.Dataset]:
     """Return ECDFs minus the uniform distribution function, and their simultaneous band."""
 
     def of_one(values: np.ndarray) -> np.ndarray:
@@ -259,54 +221,22 @@ def _uniform_band(n: int) -> tuple[np.ndarray, np.ndarray]:
     return get_pointwise_confidence_band(level, n, PIT_GRID[1:-1])
 
 
-def _log_effective(results: xr.Dataset, name: str) -> xr.DataArray | None:
-    """Return log10 of the effective number (not every backend has a log axis), or None."""
-    effective = results.get(f"{name}_n_effective")
-    if effective is None or not np.isfinite(effective).any():
-        return None
-    return xr.apply_ufunc(
-        np.log10, rename_last_dims(effective.where(np.isfinite(effective)), "time")
-    )
-
-
-def _draw_effective(collection: PlotCollection, logs: xr.Dataset) -> dict[str, dict[str, Any]]:
-    quantiles = over_draws(logs)
-    legend = draw_bands(collection, quantiles)
-    legend = draw_median(collection, quantiles) | legend
-    limit = np.log10(COLLAPSED)
-    collection.map(hline, "collapsed", data=xr.Dataset({"effective": limit}), **LIMIT)
+def _effective(found: xr.Dataset) -> tuple[xr.Dataset, list[Mark]]:
+    """Return log10 of the effective number (not every backend has a log axis) and its marks."""
+    effective = found["n_effective"].where(np.isfinite(found["n_effective"]))
+    logs = xr.apply_ufunc(np.log10, effective).to_dataset(name="effective")
+    quantiles, limit = over_draws(logs), np.log10(COLLAPSED)
     ends = np.array([min(logs["effective"].min(), limit), logs["effective"].max()])
-    collection.map(
-        label_ticks, data=logs, ticks=logarithmic_ticks(ends), ignore_aes="all", store_artist=False
-    )
-    return {**legend, "collapse": LIMIT}
+    return logs, [
+        *bands_of(quantiles),
+        median_of(quantiles),
+        Mark(hline, "collapsed", xr.Dataset({"effective": limit}), LIMIT, "collapse"),
+        Mark(y_ticks, None, logs, logarithmic_ticks(ends)),
+    ]
 
 
-def _note_failures(collection: PlotCollection, logs: xr.Dataset, idata: xr.DataTree) -> None:
-    """Write the number of failed evaluations above the panel of effective particles."""
+def _failures(idata: xr.DataTree) -> str:
+    """The number of evaluations that failed while sampling, if any did."""
     stats = idata.children.get("sample_stats")
     n_failed = 0 if stats is None or "n_failed" not in stats else int(stats["n_failed"].sum())
-    if n_failed:
-        text = f"{n_failed} evaluations failed"
-        collection.map(labelled_title, "failures", data=logs, text=text, ignore_aes="all")
-
-
-def _label_panels(
-    collection: PlotCollection, data: xr.Dataset, time: str, n_observables: int
-) -> None:
-    axes = {
-        "residual": (time, "standardised residual"),
-        "autocorrelation": ("lag (observations)", "autocorrelation"),
-        "pit": ("PIT: probability of less", "share below − expected"),
-        "inputs": ("lag (observations)", "correlation with inputs"),
-        "effective": (time, "effective number"),
-    }
-    settings: dict[str, Any] = {"ignore_aes": "all", "store_artist": False}
-    for panel in map(str, data):
-        x_label, y_label = axes[panel]
-        collection.map(labelled_x, data=data[[panel]], text=x_label, **settings)
-        collection.map(labelled_y, data=data[[panel]], text=y_label, **settings)
-    if n_observables > 1:
-        of_observables = data.drop_vars("effective", errors="ignore")
-        labels = {"labeller": NoVarLabeller(), "subset_info": True}
-        collection.map(labelled_title, "title", data=of_observables, ignore_aes="all", **labels)
+    return f"{n_failed} evaluations failed" if n_failed else ""

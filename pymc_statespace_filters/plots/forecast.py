@@ -12,25 +12,31 @@ from arviz_plots.visuals import vline
 from ..errors import ModelError
 from ..former_names import former_names
 from ..system.checks import check_count
-from .canvas import label_axes, time_label
-from .legend import add_legend, legend_style
-from .marks import (
+from .over_time import (
     DATA,
     TRUTH,
-    axis_label,
-    canvas_over_time,
-    draw_bands,
-    draw_bars,
-    draw_data,
-    draw_median,
-    functions_of,
+    bands_of,
+    bars_of,
+    connected,
+    median_of,
     over_draws,
-    point_size,
-    points,
-    transformed,
+    picture_over_time,
+    points_of,
 )
-from .panels import several_records, with_rows_of_panel
-from .results import SAMPLE_DIMS, data_of, group_of, rename_last_dims, truth_of, variable_of
+from .picture import Mark
+from .results import (
+    SAMPLE_DIMS,
+    axis_label,
+    data_of,
+    functions_of,
+    group_of,
+    names_of,
+    rows_of,
+    time_label,
+    transformed,
+    truth_of,
+    variable_of,
+)
 
 PAST = 2.0  # length of the observations shown, in lengths of the forecast
 MIN_PAST = 10  # observations
@@ -133,56 +139,56 @@ def plot_forecast(
         check_count("n_past", n_past, 0)
     group, results = group_of(idata, *((group,) if group else GROUPS))
     name = variable_of(predicted(results), var_name)
-    idata = with_rows_of_panel(idata, group, name, _labels_of_records(idata, name, model))
-    facets = several_records(idata, group, name, name, records)
-    idata, truth = facets.idata, facets.truth(truth, "observations")
-    results, transform = idata[group].to_dataset(), facets.mapping(transform)
-    draws = rename_last_dims(results[name], "time", "observable")
-    record = data_of(idata, name)
-    observables = [str(observable) for observable in draws["observable"].values]
+    labels = _labels_of_records(idata, name, model)
+    rows = rows_of(idata, results, name, name, labels).choose("records", records)
+    draws = rows.over_time(results[name]).rename({results[name].dims[-1]: "observable"})
+    record = data_of(idata, name, rows)
+    observables = names_of(draws, "observable")
     functions = functions_of(transform, observables)
-    labels = [axis_label(one, functions, draws, record) for one in observables]
+    texts = [axis_label(one, functions, draws, record) for one in observables]
     time = time_label(draws, record)
     if truth is not None:
-        truth = truth_of(truth, "observations", "observable", observables, draws["time"].values)
+        truth = truth_of(truth, "observations", "observable", draws, rows)
         truth = transformed(truth, "observable", functions)
     draws = transformed(draws, "observable", functions)
     record = None if record is None else transformed(record, "observable", functions)
-    observed = _observed_at(draws, truth, record) if errors else None
 
     data = draws.to_dataset(name="observations")
-    collection = canvas_over_time(
-        data, "observable", facets.panels_in_line, backend=backend, pc_kwargs=pc_kwargs
-    )
-    at_one_time = int(data["observations"].notnull().any(SAMPLE_DIMS).sum("time").max()) == 1
-    quantiles = over_draws(data) if at_one_time else facets.connected(over_draws(data))
-    if observed is not None:
-        labels = [f"error of {label}" for label in labels]
+    quantiles = over_draws(data)
+    at_one_time = int(quantiles["observations"].notnull().any("quantile").sum("time").max()) == 1
+    quantiles = quantiles if at_one_time else connected(quantiles)
+    marks = []
+    if errors:
+        texts = [f"error of {text}" for text in texts]
         median = quantiles.sel(quantile=0.5, drop=True)
-        quantiles, observed = quantiles - median, observed - median["observations"]
-    # Bands below the points, the median above them.
-    bands = (draw_bars if at_one_time else draw_bands)(collection, quantiles)
-    legend: dict[str, dict[str, Any]] = {}
-    if observed is not None:
-        legend |= _draw_errors(collection, observed)
+        observed = _observed_at(draws, truth, record) - median["observations"]
+        quantiles = quantiles - median
+        marks = [points_of(observed, "errors", DATA, "observed − median")]
     elif record is not None:
-        legend |= draw_data(collection, _shown(record, draws, n_past))
-        legend |= _mark_end(collection, record, draws)
+        marks = [points_of(_shown(record, draws, n_past), "data", DATA, "data")]
+        marks.append(Mark(vline, "end", _end(record, draws), END, "end of record"))
     if truth is not None and not errors:
-        legend |= _draw_truth(collection, truth, record, draws)
-    lines = {} if at_one_time else draw_median(collection, quantiles)
-    label_axes(collection, labels, time, facets.records_of(observables))
-    add_legend(collection, lines | bands | legend)
-    return collection
+        style = {"color": TRUTH["color"]}
+        marks.append(points_of(_later(truth, record, draws), "truth", style, "truth"))
+    # Bands below the points, the median above them.
+    bands = bars_of(quantiles) if at_one_time else bands_of(quantiles)
+    return picture_over_time(
+        data,
+        [*bands, *marks, *([] if at_one_time else [median_of(quantiles)])],
+        texts,
+        x=time,
+        backend=backend,
+        pc_kwargs=pc_kwargs,
+    )
 
 
-def _labels_of_records(idata: xr.DataTree, name: str, model: pm.Model | None) -> list[Any] | None:
+def _labels_of_records(idata: xr.DataTree, name: str, model: pm.Model | None) -> list[Any]:
     """The labels of the records of a panel, of the model or of a variable that is along them."""
     dim = f"{name}_record"
     if model is not None and dim in model.coords:
         return list(model.coords[dim])
     found = [node.coords[dim] for node in idata.children.values() if dim in node.coords]
-    return list(found[0].values.tolist()) if found else None
+    return list(found[0].values.tolist()) if found else []
 
 
 def predicted(results: xr.Dataset) -> xr.Dataset:
@@ -203,43 +209,24 @@ def _shown(record: xr.DataArray, draws: xr.DataArray, n_past: int | None) -> xr.
     return record.isel(time=slice(max(n_before - n_past, 0), None))
 
 
-def _mark_end(
-    collection: PlotCollection, record: xr.DataArray, draws: xr.DataArray
-) -> dict[str, dict[str, Any]]:
-    """Draw a line at the last observation if predictions follow; return its legend entry."""
+def _end(record: xr.DataArray, draws: xr.DataArray) -> xr.Dataset:
+    """Return the time of the last observation, where predictions follow."""
+    kept = ("record", "observable")
     end, last = (
-        array["time"].where(array.notnull()).max([dim for dim in array.dims if dim != "observable"])
+        array["time"].where(array.notnull()).max([dim for dim in array.dims if dim not in kept])
         for array in (record, draws)
     )
-    end = end.reindex(observable=draws["observable"]).where(end < last)
-    if not end.notnull().any():
-        return {}
-    collection.map(vline, "end", data=end.to_dataset(name="end"), **END)
-    return {"end of record": END}
+    end = end.reindex(observable=draws["observable"])
+    return end.where(end < last).to_dataset(name="end")
 
 
-def _draw_truth(
-    collection: PlotCollection,
-    truth: xr.DataArray,
-    record: xr.DataArray | None,
-    draws: xr.DataArray,
-) -> dict[str, dict[str, Any]]:
-    """Draw the actual observations from the predictions on; return their legend entry."""
+def _later(truth: xr.DataArray, record: xr.DataArray | None, draws: xr.DataArray) -> xr.DataArray:
+    """Return the actual observations from the predictions on."""
     if record is not None:
         times = truth["time"]  # numbers or dates
         is_later = (times >= draws["time"].values[0]) | (times > record["time"].values[-1])
         truth = truth.where(is_later, drop=True)
-    actual = truth.reindex(observable=draws["observable"])
-    style = {"color": TRUTH["color"], **point_size(actual)}
-    collection.map(points, "truth", data=actual.to_dataset(name="truth"), **style)
-    return {"truth": legend_style(TRUTH)}
-
-
-def _draw_errors(collection: PlotCollection, observed: xr.DataArray) -> dict[str, dict[str, Any]]:
-    """Draw observation minus median prediction as points; return their legend entry."""
-    data = observed.to_dataset(name="errors")
-    collection.map(points, "errors", data=data, **DATA, **point_size(observed))
-    return {"observed − median": legend_style(DATA)}
+    return truth.reindex(observable=draws["observable"])
 
 
 def _observed_at(

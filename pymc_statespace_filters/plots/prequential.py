@@ -3,18 +3,19 @@
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import xarray as xr
 from arviz_plots import PlotCollection
-from arviz_plots.plot_collection import backend_from_object
 
 from ..evidence import compare_evidence
-from .canvas import band, curve, interval, label_axes, style_of_curve
-from .legend import add_legend
-from .marks import canvas_over_time
+from .picture import Mark, along_models, picture, style_of_curve
+from .shapes import band, bars, curve, from_zero, interval
 
 N_ERRORS = 2  # of standard errors, of a band
-PANELS = "score_difference", "log_bayes_factor", "probability"
+PANELS = {
+    "score_difference": "score difference",
+    "log_bayes_factor": "log Bayes factor",
+    "probability": "probability",
+}
 
 
 def plot_prequential(
@@ -41,8 +42,8 @@ def plot_prequential(
     Returns
     -------
     arviz_plots.PlotCollection
-        Visuals ``score_NAME``, ``factor_NAME``, ``factor_band_NAME``, ``probability_NAME`` and
-        ``probability_band_NAME`` for each model, along ``panel``.
+        Visuals ``bar`` of the variable ``score_difference``, and ``curve`` and ``band`` of
+        ``log_bayes_factor`` and ``probability``, along ``model``.
 
     Raises
     ------
@@ -75,50 +76,28 @@ def plot_prequential(
     >>> collection = psf.plot_prequential({"persistent": run(0.9), "alternating": run(-0.9)})
     >>> collection.savefig("prequential.png")  # doctest: +SKIP
     """
-    table = compare_evidence(results, by="row").rename(row="time")
+    table = compare_evidence(results, by="row")
     models = [str(name) for name in table["model"].values]
-    first = table[PANELS[0]].isel(model=0, drop=True)
-    shape = xr.Dataset({"value": first.expand_dims(panel=list(PANELS))})
-    texts = [f"{models[0]} (reference)", *models[1:]]
-    collection = canvas_over_time(
-        shape, "panel", 1, backend=backend, pc_kwargs=pc_kwargs, key=texts
+    spread = N_ERRORS * table["log_bayes_factor_se"]
+    low, high = (
+        xr.Dataset(
+            {"log_bayes_factor": table["log_bayes_factor"] + sign * spread, "probability": p}
+        )
+        for sign, p in ((-1, table["probability_low"]), (1, table["probability_high"]))
     )
-    styles = {name: style_of_curve(i) for i, name in enumerate(models)}
-    for name, style in styles.items():
-        _draw_model(collection, table.sel(model=name, drop=True), name, style)
-    labels = ["score difference", "log Bayes factor", "probability"]
-    label_axes(collection, labels, "time")
-    entries = {t: {**style, "width": 2} for t, style in zip(texts, styles.values(), strict=True)}
-    add_legend(collection, entries)
-    return collection
-
-
-def _draw_model(
-    collection: PlotCollection, course: xr.Dataset, name: str, style: dict[str, Any]
-) -> None:
-    """Draw one model in all panels."""
-
-    def in_panel(panel: str, values: xr.DataArray) -> xr.Dataset:
-        only = values.expand_dims(panel=[panel]).reindex(panel=list(PANELS))
-        return xr.Dataset({"value": only})
-
-    scores, factor = course["score_difference"], course["log_bayes_factor"]
-    spread = N_ERRORS * course["log_bayes_factor_se"]
-    bounds = {
-        "factor": ("log_bayes_factor", factor - spread, factor + spread),
-        "probability": ("probability", course["probability_low"], course["probability_high"]),
-    }
-    collection.map(stems, f"score_{name}", data=in_panel(PANELS[0], scores), width=1.5, **style)
-    for short, (panel, low, high) in bounds.items():
-        ends = interval(in_panel(panel, low), in_panel(panel, high))
-        collection.map(band, f"{short}_band_{name}", data=ends, alpha=0.25, color=style["color"])
-        values = in_panel(panel, course[panel])
-        collection.map(curve, f"{short}_{name}", data=values, width=1.5, **style)
-
-
-def stems(da: xr.DataArray, target: Any, **kwargs: Any) -> Any:
-    """Draw a line from zero to each value."""
-    (dim,) = da.dims
-    times, values = np.repeat(da[dim].values, 3), np.zeros(3 * da.size)
-    values[1::3], values[2::3] = da.values, np.nan
-    return backend_from_object(target).line(times, values, target, **kwargs)
+    scores, courses = table[["score_difference"]], table[["log_bayes_factor", "probability"]]
+    texts = [f"{models[0]} (reference)", *models[1:]]
+    return picture(
+        table[list(PANELS)],
+        [
+            Mark(bars, "bar", from_zero(scores), {"width": 1.5}),
+            Mark(band, "band", interval(low, high), {"alpha": 0.25}),
+            Mark(curve, "curve", courses, {"width": 1.5}, dict(zip(models, texts, strict=True))),
+        ],
+        x="time",
+        y=PANELS,
+        cols=["__variable__"],
+        backend=backend,
+        pc_kwargs=pc_kwargs,
+        aesthetics=along_models([style_of_curve(i) for i in range(len(models))]),
+    )

@@ -7,16 +7,15 @@ import numpy as np
 import xarray as xr
 from arviz_plots import PlotCollection
 from arviz_plots.plot_collection import backend_from_object
-from arviz_plots.visuals import labelled_x, labelled_y, set_xlim, set_xticks, set_ylim
+from arviz_plots.visuals import set_xlim, set_xticks, set_ylim
 
 from ..errors import ModelError
-from .canvas import band, canvas, curve, interval, logarithmic_ticks, size_of_panels, style_of_curve
-from .legend import add_legend
+from .picture import Mark, along_models, picture, style_of_curve
+from .shapes import band, curve, interval, logarithmic_ticks
 
-AES = ["color", "linestyle"]
 ENDS = ("width_prob_low", "width_prob_high")
-LABEL_WIDTH, NOTE_WIDTH = 44, 32  # characters, of a line below the panel and inside it
-LINE = 0.22  # inches, of a line below a panel
+SIZE, NOTE_WIDTH = (6.0, 3.2), 32  # inches of the panel; characters of a line inside it
+LINE = 0.22  # inches, of a line below the panel
 
 
 def plot_prior_sensitivity(
@@ -73,53 +72,28 @@ def plot_prior_sensitivity(
     found = curves.assign_coords(width=np.log10(curves["width"]))
     probs = found[["width_prob"]]
     low, high = (found[[name]].rename({name: "width_prob"}) for name in ENDS)
-    width, height = size_of_panels(1)
     models = [str(name) for name in probs["model"].values]
-    styles = [style_of_curve(i) for i in range(len(models))]
-    collection = canvas(
+    share = f"{100 * found.attrs['ci_prob']:g} % " if "ci_prob" in found.attrs else ""
+    about = _about_priors(probs)
+    ticks = logarithmic_ticks(probs["width"].values)
+    shown = probs.fillna(0.0)  # a panel without results has axes too
+    return picture(
         probs,
+        [
+            Mark(band, "band", interval(low, high), {"alpha": 0.25}, f"{share}interval"),
+            Mark(curve, "curve", probs, {"width": 2}, {name: name for name in models}),
+            Mark(set_ylim, None, shown, {"limits": (-0.02, 1.02)}),
+            Mark(set_xticks, None, shown, ticks),
+            *_note_empty(found),
+        ],
+        x="width of the priors (factor)" + about,
+        y=f"probability of the {probs.attrs.get('width_of', 'model')}",
+        cols=["__variable__"],
+        size=(SIZE[0], SIZE[1] + LINE * about.count("\n")),
         backend=backend,
         pc_kwargs=pc_kwargs,
-        aes={name: ["model"] for name in AES},
-        color=[style["color"] for style in styles],
-        linestyle=[style["linestyle"] for style in styles],
-        key=[*models, "interval"],
-        size=(width, height + LINE * _about_priors(probs).count("\n")),
-        n_panels=1,
-        cols=["__variable__"],
+        aesthetics=along_models([style_of_curve(i) for i in range(len(models))]),
     )
-    collection.map(band, "band", data=interval(low, high), alpha=0.25, ignore_aes={"linestyle"})
-    collection.map(curve, "curve", width=2)
-    _label_axes(collection, probs)
-    _note_empty(collection, found)
-    legend = {
-        name: {**collection.get_aes_kwargs(AES, "mapping", {"model": name}), "width": 2}
-        for name in models
-    }
-    if low["width_prob"].notnull().any():
-        share = f"{100 * found.attrs['ci_prob']:g} % " if "ci_prob" in found.attrs else ""
-        legend[f"{share}interval"] = {"color": "B3", "alpha": 0.4, "width": 8}
-    add_legend(collection, legend)
-    return collection
-
-
-def _label_axes(collection: PlotCollection, probs: xr.Dataset) -> None:
-    # A panel without results has axes too.
-    settings: dict[str, Any] = {
-        "data": probs.fillna(0.0),
-        "ignore_aes": "all",
-        "store_artist": False,
-    }
-    text = "width of the priors (factor)" + _about_priors(probs)
-    collection.map(labelled_x, text=text, **settings)
-    of_what = f"probability of the {probs.attrs.get('width_of', 'model')}"
-    collection.map(labelled_y, text=of_what, **settings)
-    collection.map(set_ylim, limits=(-0.02, 1.02), **settings)
-    if probs["width_prob"].isnull().all():
-        ends = probs["width"].values[[0, -1]]
-        margin = 0.05 * (ends[1] - ends[0])
-        collection.map(set_xlim, limits=(ends[0] - margin, ends[1] + margin), **settings)
-    collection.map(set_xticks, **logarithmic_ticks(probs["width"].values), **settings)
 
 
 def _about_priors(probs: xr.Dataset) -> str:
@@ -128,23 +102,28 @@ def _about_priors(probs: xr.Dataset) -> str:
         "without the prior of": probs.attrs.get("width_left_out"),
         "mostly unknown due to the prior of": probs.attrs.get("width_unknown"),
     }
-    lines = [fill(f"{text} {names}", LABEL_WIDTH) for text, names in notes.items() if names]
+    lines = [f"{text} {names}" for text, names in notes.items() if names]
     missing = probs["width_prob"].isnull().any("model")
     if missing.any() and not missing.all():  # an empty panel has a note
         lines.append(f"no result at {int(missing.sum())} of {missing.size} widths")
     return "".join(f"\n{line}" for line in lines)
 
 
-def _note_empty(collection: PlotCollection, found: xr.Dataset) -> None:
+def _note_empty(found: xr.Dataset) -> list[Mark]:
     """Write into the panel why it is empty, if it is."""
     if found["width_prob"].notnull().any():
-        return
+        return []
     why = found.attrs.get("width_note") or "the draws do not determine it"
-    lines = [fill(line, NOTE_WIDTH) for line in ("no result at any width:", why)]
-    data = xr.Dataset({"width_prob": found["width"].values[[0, -1]].mean()})
-    collection.map(note, "note", data=data, ignore_aes="all", text="\n".join(lines), color="B2")
+    text = "\n".join(fill(line, NOTE_WIDTH) for line in ("no result at any width:", why))
+    ends = found["width"].values[[0, -1]]
+    margin = 0.05 * (ends[1] - ends[0])
+    middle = xr.Dataset({"width_prob": ends.mean()})
+    return [
+        Mark(set_xlim, None, middle, {"limits": (ends[0] - margin, ends[1] + margin)}),
+        Mark(note, "note", middle, {"text": text, "color": "B2"}),
+    ]
 
 
-def note(da: xr.DataArray, target: Any, *, text: str, **kwargs: Any) -> Any:
+def note(da: xr.DataArray, target: Any, *, text: str, color: str, **kwargs: Any) -> Any:
     """Write a text in the middle of a panel of probabilities."""
-    return backend_from_object(target).text(da.item(), 0.5, text, target, **kwargs)
+    return backend_from_object(target).text(da.item(), 0.5, text, target, color=color)

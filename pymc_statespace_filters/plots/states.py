@@ -3,48 +3,49 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import xarray as xr
 from arviz_plots import PlotCollection
 
 from ..errors import ModelError
 from ..former_names import former_names
 from ..system.checks import check_count
-from .canvas import curve, label_axes, time_label
-from .finite import draw_ribbons, is_continuous, ribbons
-from .legend import add_legend
-from .marks import (
-    DOTS,
+from .finite import ribbons, tick_values
+from .over_time import (
+    DATA,
     DRAWS,
-    FEW,
-    PATHS,
     TRUTH,
-    Functions,
-    axis_label,
-    canvas_over_time,
-    draw_bands,
-    draw_bars,
-    draw_data,
-    draw_median,
-    functions_of,
+    bands_of,
+    bars_of,
+    connected,
+    median_of,
     over_draws,
-    paths,
-    points,
-    thin_draws,
-    transformed,
+    picture_over_time,
+    points_of,
 )
-from .panels import Facets, facets_of_simulation, several_records
+from .picture import Mark
 from .results import (
+    SAMPLE_DIMS,
+    axis_label,
     data_of,
+    functions_of,
+    group_of,
     measured_by,
-    name_of_states,
+    names_of,
     observations_of,
+    rows_of,
+    rows_of_simulation,
     select_names,
-    sensors_of,
-    states_of,
+    time_label,
+    transformed,
     truth_of,
+    variable_of,
 )
+from .shapes import FEW, band, curve, paths, points
 
-PATH = {**DRAWS, "width": 1.5}
+PATHS = {"color": "C0", "alpha": 0.4, "width": 0.6}
+DOTS = {"color": "C0", "alpha": 0.4, "diameter": 2}
+RIBBON = {**DRAWS, "alpha": 0.5}
 
 
 @former_names
@@ -141,80 +142,72 @@ def plot_states(
     if isinstance(idata, xr.Dataset):
         refuse_without_draws(group=group, var_name=var_name, truth=truth, n_draws=n_draws or None)
         return draw_simulation(idata, records, states, observables, transform, backend, pc_kwargs)
-    group, name = name_of_states(idata, group, var_name)
-    facets = several_records(idata, group, name, f"{name}_states", records)
-    idata, truth, states = facets.idata, facets.truth(truth, "states"), facets.names(states)
-    observables = facets.mapping(observables, to_names=True)
-    transform = facets.mapping(transform)
-    _, draws, at_observations, are_paths = states_of(idata, group, name)
-    all_states = [str(state) for state in draws["state"].values]
+    groups = ("smoothed_states", "filtered_states") if group is None else (group,)
+    group, results = group_of(idata, *groups)
+    name = variable_of(results, var_name, "_states")
+    variable = results[f"{name}_states"]
+    rows = rows_of(idata, results, f"{name}_states", name).choose("records", records)
+    draws = rows.over_time(variable).rename({variable.dims[-1]: "state"})
+    record = data_of(idata, name, rows)
+    if record is None and observables:
+        raise ModelError(f"observables needs observed_data[{name!r}] in idata, got none")
+    measured = {} if record is None else measured_by(observables, draws, record)
+    all_states = names_of(draws, "state")
     shown = select_names("states", states, all_states)
-    record, measured = _record(idata, name, observables, draws, facets)
-    seen = [] if record is None else [str(one) for one in record["observable"].values]
-    functions = functions_of(transform, all_states, seen)
+    functions = functions_of(
+        transform, all_states, () if record is None else names_of(record, "observable")
+    )
     if observables is None:  # what is a state is drawn as that state
         of_state = {one: functions[state] for state, one in measured.items() if state in functions}
         functions = of_state | dict(functions)
-    true = None if truth is None else _truth(truth, draws, functions, shown)
 
+    at_observations = results.attrs.get("at") == "observations"
     data = transformed(draws.sel(state=shown), "state", functions).to_dataset(name="states")
-    collection = canvas_over_time(
-        data, "state", facets.panels_in_line, backend=backend, pc_kwargs=pc_kwargs
-    )
+    finite, marks = ribbons(data["states"]), []
+    quantiles = over_draws(data)
+    if finite is not None:
+        edges = connected(finite.reindex(state=shown).to_dataset(name="states"))
+        quantiles = quantiles.where(~data["state"].isin(finite["state"]))
+        marks = [
+            Mark(band, "probability", edges, RIBBON, "probability"),
+            Mark(tick_values, None, edges),
+        ]
+    lines = []
     # Bands below the points, lines above them.
-    as_bars = at_observations and data.sizes["time"] <= FEW
-    quantiles = over_draws(data) if as_bars else facets.connected(over_draws(data))
-    edges = ribbons(data["states"])
-    bands: dict[str, Any] = {}
-    if edges is not None:
-        quantiles = quantiles.where(is_continuous(edges))
-        bands = draw_ribbons(collection, facets.connected(edges))
-    if has_bands := bool(edges is None or is_continuous(edges).any()):
-        bands |= (draw_bars if as_bars else draw_bands)(collection, quantiles)
+    if at_observations and data.sizes["time"] <= FEW:
+        marks += bars_of(quantiles)
+    else:
+        marks += bands_of(connected(quantiles))
+        lines = [median_of(connected(quantiles))]
     if n_draws:
-        mark, style = (paths, PATHS) if are_paths else (points, DOTS)
-        collection.map(mark, "draws", data=thin_draws(data, n_draws), **style)
-    legend = {}
-    if record is not None and set(shown) & set(measured):
-        record = transformed(record, "observable", functions)
-        legend = draw_data(collection, observations_of(record, measured, shown))
-    lines = draw_median(collection, quantiles) if has_bands and not as_bars else {}
-    if true is not None:
-        collection.map(curve, "truth", data=true.to_dataset(name="truth"), **TRUTH)
-        legend = {"truth": TRUTH} | legend
-    labels = [axis_label(state, functions, draws) for state in shown]
-    label_axes(collection, labels, time_label(draws, record), facets.records_of(shown))
-    add_legend(collection, lines | bands | legend)
-    return collection
+        are_paths = group != "filtered_states" and not at_observations
+        draw, style = (paths, PATHS) if are_paths else (points, DOTS)
+        marks.append(Mark(draw, "draws", _thinned(data, n_draws), style, "draws"))
+    if record is not None:
+        data_points = observations_of(transformed(record, "observable", functions), measured, shown)
+        marks.append(points_of(data_points, "data", DATA, "data"))
+    if truth is not None:
+        true = truth_of(truth, "states", "state", draws, rows)
+        begin, end = draws["time"].values[[0, -1]]
+        true = true.where((true["time"] >= begin) & (true["time"] <= end), drop=True)
+        true = transformed(true, "state", functions).reindex(state=shown)
+        lines.append(Mark(curve, "truth", connected(true.to_dataset(name="truth")), TRUTH, "truth"))
+    return picture_over_time(
+        data,
+        [*marks, *lines],
+        [axis_label(state, functions, draws) for state in shown],
+        x=time_label(draws, record),
+        backend=backend,
+        pc_kwargs=pc_kwargs,
+    )
 
 
-def _truth(
-    truth: Any, draws: xr.DataArray, functions: Functions, shown: Sequence[str]
-) -> xr.DataArray:
-    """Return the true states within the times of the draws."""
-    all_states = [str(state) for state in draws["state"].values]
-    true = truth_of(truth, "states", "state", all_states, draws["time"].values)
-    begin, end = draws["time"].values[[0, -1]]
-    true = true.where((true["time"] >= begin) & (true["time"] <= end), drop=True)
-    return transformed(true, "state", functions).reindex(state=shown)
-
-
-def _record(
-    idata: xr.DataTree,
-    name: str,
-    observables: Mapping[str, str] | None,
-    draws: xr.DataArray,
-    facets: Facets,
-) -> tuple[xr.DataArray | None, dict[str, str]]:
-    """Return the observations if idata has them, and the observable of each measured state."""
-    record = data_of(idata, name)
-    if record is None:
-        if observables:
-            raise ModelError(f"observables needs observed_data[{name!r}] in idata, got none")
-        return None, {}
-    states, there = ([str(one) for one in a[a.dims[-1]].values] for a in (draws, record))
-    sensors = facets.mapping(sensors_of(draws), to_names=True)
-    return record, measured_by(observables, states, there, sensors)
+def _thinned(draws: xr.Dataset, n_draws: int) -> xr.Dataset:
+    """Return `n_draws` of the draws that are not all NaN, evenly, along the dimension "path"."""
+    stacked = draws.stack(path=SAMPLE_DIMS).drop_vars(["path", *SAMPLE_DIMS])
+    stacked = stacked.dropna("path", how="all")
+    n_draws = min(n_draws, stacked.sizes["path"])
+    return stacked.isel(path=np.linspace(0, stacked.sizes["path"] - 1, n_draws).astype(int))
 
 
 def refuse_without_draws(**given: Any) -> None:
@@ -238,32 +231,28 @@ def draw_simulation(
             "idata must be a DataTree of draws or a result of simulate, got a Dataset of "
             f"{[str(name) for name in simulated]}"
         )
-    facets = facets_of_simulation(simulated, records)
-    path, record = (facets.simulated(simulated, name) for name in ("states", "observations"))
-    states, transform = facets.names(states), facets.mapping(transform)
-    observables = facets.mapping(observables, to_names=True)
-    all_states, seen = ([str(n) for n in a[a.dims[-1]].values] for a in (path, record))
-    measured = measured_by(observables, all_states, seen, {})
-    shown = select_names("states", states, all_states)
+    path, record = (
+        rows_of_simulation(simulated, name).choose("records", records).over_time(simulated[name])
+        for name in ("states", "observations")
+    )
+    all_states, seen = names_of(path, "state"), names_of(record, "observable")
+    measured = measured_by(observables, path, record)
+    panels = select_names("states", states, all_states)
     if states is None:  # an observable that measures no state has a panel
         alone = [one for one in seen if one not in measured.values() and one not in all_states]
         measured |= {one: one for one in alone}
-        panels = [*shown, *alone]
-    else:
-        panels = shown
-
+        panels += alone
     functions = functions_of(transform, all_states, seen)
-    path = transformed(path, "state", functions)
-    record = transformed(record, "observable", functions)
-    data = path.reindex(state=panels).to_dataset(name="path")
-    collection = canvas_over_time(
-        data, "state", facets.panels_in_line, backend=backend, pc_kwargs=pc_kwargs
+    drawn = transformed(path, "state", functions).reindex(state=panels).to_dataset(name="path")
+    data = observations_of(transformed(record, "observable", functions), measured, panels)
+    return picture_over_time(
+        drawn,
+        [
+            points_of(data, "data", DATA, "data"),
+            Mark(curve, "path", connected(drawn), {**DRAWS, "width": 1.5}, "path"),
+        ],
+        [axis_label(one, functions, path, record) for one in panels],
+        x=time_label(path, record),
+        backend=backend,
+        pc_kwargs=pc_kwargs,
     )
-    legend = {}
-    if set(measured) & set(panels):
-        legend = draw_data(collection, observations_of(record, measured, panels))
-    collection.map(curve, "path", **PATH)
-    labels = [axis_label(one, functions, path, record) for one in panels]
-    label_axes(collection, labels, time_label(path, record), facets.records_of(panels))
-    add_legend(collection, {"path": PATH} | legend)
-    return collection

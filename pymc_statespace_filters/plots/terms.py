@@ -1,19 +1,17 @@
 """Plot of the probabilities of terms, from `select_terms`."""
 
-import math
 from typing import Any
 
 import xarray as xr
 from arviz_plots import PlotCollection
-from arviz_plots.visuals import labelled_x, line_x, scatter_x, set_xlim
+from arviz_plots.visuals import line_x, scatter_x, set_xlim
 
 from ..errors import ModelError
-from .canvas import annotate, canvas_of_rows, format_probability, interval
-from .evidence import ends
-from .legend import add_legend, legend_style
+from .picture import Mark
+from .rows import decimals, ends, format_probability, picture_of_rows
+from .shapes import interval
 
 STYLE = {"color": "C0"}
-PRIOR = {"color": "B3", "width": 2}
 NEEDED = {"inclusion", "inclusion_se", "prior_inclusion"}
 N_ERRORS = 2
 
@@ -66,23 +64,23 @@ def plot_terms(
     error = N_ERRORS * terms["inclusion_se"]
     bounds = interval((points - error).clip(0, 1), (points + error).clip(0, 1))
     prior = terms[["prior_inclusion"]].rename(prior_inclusion="inclusion")
-    collection = canvas_of_rows(points, backend=backend, pc_kwargs=pc_kwargs)
-    collection.map(ends, "prior", data=interval(prior, prior), **PRIOR)
-    collection.map(line_x, "interval", data=bounds, width=2, **STYLE)
-    collection.map(scatter_x, "point", **STYLE)
     texts = xr.apply_ufunc(
-        _text,
-        terms["inclusion"],
-        terms["inclusion_se"],
-        vectorize=True,
-        output_dtypes=[object],
+        _text, terms["inclusion"], terms["inclusion_se"], vectorize=True, output_dtypes=[object]
     )
-    collection.map(annotate, "text", texts=texts, middle=0.5, color="B2")
-    collection.map(set_xlim, ignore_aes="all", limits=(-0.02, 1.02), store_artist=False)
-    collection.map(labelled_x, "x_label", ignore_aes="all", text="probability of the term")
-    legend = {"probability, two standard errors": legend_style(STYLE), "prior": PRIOR}
-    add_legend(collection, legend)
-    return collection
+    return picture_of_rows(
+        points,
+        [
+            Mark(ends, "prior", interval(prior, prior), {"color": "B3", "width": 2}, "prior"),
+            Mark(line_x, "interval", bounds, {"width": 2, **STYLE}, "two standard errors"),
+            Mark(scatter_x, "point", points, STYLE, "probability"),
+            Mark(set_xlim, None, points, {"limits": (-0.02, 1.02)}),
+        ],
+        texts,
+        middle=0.5,
+        x="probability of the term",
+        backend=backend,
+        pc_kwargs=pc_kwargs,
+    )
 
 
 def _terms(found: xr.DataTree) -> xr.Dataset:
@@ -98,7 +96,6 @@ def _terms(found: xr.DataTree) -> xr.Dataset:
 
 
 def _text(probability: float, error: float) -> str:
-    if not 0 < error < math.inf or not 0.01 <= probability <= 0.99:
+    if not 0.01 <= probability <= 0.99 or not error > 0:
         return format_probability(probability)
-    digits = min(max(2, math.ceil(-math.log10(error))), 4)
-    return f"{probability:.{digits}f} ± {error:.{digits}f}"
+    return f"{probability:.{decimals(error)}f} ± {error:.{decimals(error)}f}"

@@ -35,21 +35,15 @@ def test_residuals_over_time(collection, diagnostics):
     np.testing.assert_array_equal(seen["speed"]["y"], expected.sel(observable="speed"))
     np.testing.assert_array_equal(seen["position"]["x"], np.delete(TIMES, 3))
     band = drawn(collection, "expected", "residual")["speed"]
-    assert set(band["y_top"]) == {1.96}
-    assert set(band["y_bottom"]) == {-1.96}
+    assert (band["ymin"], band["ymax"]) == (-1.96, 1.96)
 
 
-def test_autocorrelation_of_the_residuals_that_there_are(collection, diagnostics):
-    seen = drawn(collection, "seen", "autocorrelation")
-    for name, n in (("position", 40), ("speed", 41)):
-        z = diagnostics["filter_diagnostics"]["d_residual"].sel(observable=name).dropna("d_time")
-        z = z.values - z.values.mean()
-        expected = [z[k:] @ z[:-k] / (z @ z) for k in range(1, 11)]
-        heights = np.asarray(seen[name]["y"]).reshape(-1, 3)
-        np.testing.assert_allclose(heights[:, 1], expected, atol=1e-12)
-        assert (heights[:, 0] == 0).all()
+def test_autocorrelation_and_its_band(collection):
+    seen = drawn(collection, "seen", "autocorrelation")["speed"]
+    np.testing.assert_allclose(np.reshape(seen["y"], (-1, 3))[:, 1], -0.02 * np.arange(1, 11))
+    for name, n in (("position", 40), ("speed", 41)):  # of one, an observation is missing
         band = drawn(collection, "expected", "autocorrelation")[name]
-        np.testing.assert_allclose(band["y_top"], 1.96 / np.sqrt(n))
+        np.testing.assert_allclose(band["ymax"], 1.96 / np.sqrt(n))
 
 
 def test_distribution_of_the_pit_against_the_uniform_one(collection, diagnostics):
@@ -94,7 +88,7 @@ def test_effective_particles_and_the_line_of_collapse(collection):
     panel = collection.viz["plot"]["effective"].item()
     (ticks,) = (thing for thing in panel if thing["function"] == "yticks")
     assert ticks["labels"] == ["1", "3", "10", "30", "100"]
-    assert collection.viz["failures"]["effective"].item()["string"].startswith("12 evaluations")
+    assert collection.viz["title"]["effective"].item()["string"] == "12 evaluations failed"
 
 
 def test_a_deterministic_filter_has_no_panel_of_particles(diagnostics):
@@ -111,7 +105,7 @@ def test_residuals_that_are_cut_off_are_crossed_out():
     group["d_clipped"] = (("d_time", "observable"), clipped)
     tree = xr.DataTree.from_dict({"filter_diagnostics": group})
     (key,) = plot_filter_health(tree).viz["figure"].item().legends
-    assert key.get_lines()[-1].get_marker() == "x"
+    assert [line.get_marker() for line in key.get_lines()][-1] == "x"
     crosses = drawn(plot_filter_health(tree, backend="none"), "clipped", "residual")["y"]
     np.testing.assert_array_equal(crosses["x"], [1, 2])
     np.testing.assert_array_equal(crosses["y"], [2.8, -2.8])
@@ -129,8 +123,8 @@ def test_the_largest_correlation_with_an_input_at_each_lag():
     np.testing.assert_array_equal(heights[:, 1], [-0.4, 0.05])
     band = drawn(collection, "expected", "inputs")["y"]
     # The larger of two standard normals is within this in 95 % of all cases.
-    np.testing.assert_allclose(2 * norm.cdf(10 * band["y_top"]) - 1, np.sqrt(0.95))
-    np.testing.assert_allclose(band["y_bottom"], -np.asarray(band["y_top"]))
+    np.testing.assert_allclose(2 * norm.cdf(10 * band["ymax"]) - 1, np.sqrt(0.95))
+    assert band["ymin"] == -band["ymax"]
 
 
 def test_names_of_axes_and_panels(diagnostics):

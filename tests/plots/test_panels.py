@@ -62,20 +62,20 @@ def drawn_points(collection, visual, **where):
 
 def test_each_record_has_a_panel_with_its_own_data(states):
     collection = plot_states(states, backend="matplotlib")
-    assert list(collection.viz["plot"]["state"].values) == ["A: level", "B: level"]
+    assert list(collection.viz["plot"]["record"].values) == LABELS
     for label in LABELS:
-        points = drawn_points(collection, "data", state=f"{label}: level")
+        points = drawn_points(collection, "data", record=label, state="level")
         rows = label == OF_ROWS
         np.testing.assert_array_equal(points, np.stack([TIMES[rows], DATA[rows]], axis=1))
 
 
 def test_chosen_records_in_their_order(states):
     collection = plot_states(states, records="B", backend="none")
-    assert list(collection.viz["plot"]["state"].values) == ["B: level"]
+    assert list(collection.viz["plot"]["record"].values) == ["B"]
     collection = plot_states(
         states, records=["B", "A"], backend="none", transform={"level": np.exp}
     )
-    assert list(collection.viz["plot"]["state"].values) == ["B: level", "A: level"]
+    assert list(collection.viz["plot"]["record"].values) == ["B", "A"]
 
 
 def test_no_more_than_twelve_records_unless_they_are_named():
@@ -90,15 +90,15 @@ def test_no_more_than_twelve_records_unless_they_are_named():
         attrs={"at": "steps"},
     )
     idata = xr.DataTree.from_dict({"smoothed_states": results})
-    assert plot_states(idata, backend="none").viz["plot"].sizes["state"] == 12
-    assert plot_states(idata, records=labels, backend="none").viz["plot"].sizes["state"] == 15
+    assert plot_states(idata, backend="none").viz["plot"].sizes["record"] == 12
+    assert plot_states(idata, records=labels, backend="none").viz["plot"].sizes["record"] == 15
 
 
 def test_a_line_does_not_break_at_the_times_of_other_records():
     dims = ("chain", "draw", "d_obs", "observable")
     idata = a_tree("free_run", "d", DRAWN[..., None], dims, "observable")
     collection = plot_forecast(idata, backend="matplotlib")
-    line = collection.get_viz("median", observable="A: level")
+    line = collection.get_viz("median", record="A", observable="level")
     x, y = line.get_xdata(), line.get_ydata()
     known = np.isfinite(y)
     np.testing.assert_array_equal(np.flatnonzero(known), np.arange(1, 5))  # 1, 2, 3 and 4
@@ -114,7 +114,8 @@ def test_a_forecast_begins_at_the_end_of_its_record():
     idata["predictions"] = xr.DataTree(later)
     collection = plot_forecast(idata, backend="matplotlib")
     ends = [
-        collection.get_viz("end", observable=f"{label}: level").get_xdata()[0] for label in LABELS
+        collection.get_viz("end", record=label, observable="level").get_xdata()[0]
+        for label in LABELS
     ]
     assert ends == [4.0, 6.0]
 
@@ -125,9 +126,9 @@ def test_the_truth_of_a_panel_is_its_simulation(states):
         coords={"record": ("row", OF_ROWS), "time": ("row", TIMES), "state": ["level"]},
     )
     collection = plot_states(states, truth=simulated, backend="matplotlib")
-    line = collection.get_viz("truth", state="A: level")
-    known = np.isfinite(line.get_ydata())
-    np.testing.assert_array_equal(line.get_ydata()[known], DATA[:3])
+    line = collection.get_viz("truth", record="A", state="level")
+    own = np.isin(line.get_xdata(), TIMES[:3])  # between them the line goes on
+    np.testing.assert_array_equal(line.get_ydata()[own], DATA[:3])
     with pytest.raises(ModelError, match=r"truth of a panel must be the result of psf.simulate"):
         plot_states(states, truth=DATA, backend="none")
 
@@ -148,12 +149,12 @@ def test_a_simulated_panel_has_panels_of_its_records():
         },
     )
     collection = plot_states(simulated, records=["B"], backend="matplotlib")
-    assert list(collection.viz["plot"]["state"].values) == ["B: level"]
+    assert list(collection.viz["plot"]["record"].values) == ["B"]
     np.testing.assert_array_equal(
-        collection.get_viz("path", state="B: level").get_ydata(), DATA[3:]
+        collection.get_viz("path", record="B", state="level").get_ydata(), DATA[3:]
     )
     np.testing.assert_array_equal(
-        drawn_points(collection, "data", state="B: level")[:, 1], DATA[3:] + 1.0
+        drawn_points(collection, "data", record="B", state="level")[:, 1], DATA[3:] + 1.0
     )
     with pytest.raises(ModelError, match=r"records must be None without a panel, got \['B'\]"):
         plot_states(
@@ -191,19 +192,19 @@ def test_diagnostics_of_one_record(plot, diagnostics):
         ends = bars.get_ydata().reshape(-1, 3)[:, 1]  # from zero, to the value, and a gap
         of_records = diagnostics["filter_diagnostics"]["d_autocorrelation"]
         np.testing.assert_allclose(np.sort(np.abs(ends)), np.sort(np.abs(of_records[1, :, 0])))
-    with pytest.raises(ModelError, match=r"record must be a label .* \['A', 'B'\], got None"):
+    with pytest.raises(ModelError, match=r"record must be among the labels \['A', 'B'\], got None"):
         plot(diagnostics, backend="none")
 
 
 def test_what_is_refused(states):
-    with pytest.raises(ModelError, match=r"records must be labels .* got \['C'\]"):
+    with pytest.raises(ModelError, match=r"records must be among the labels .* got \['C'\]"):
         plot_states(states, records=["C"], backend="none")
     alone = xr.Dataset(
         {"d_states": (("chain", "draw", "d_time", "state"), DRAWN[..., None])},
         coords={"d_time": np.arange(8.0), "state": ["level"]},
     )
     alone = xr.DataTree.from_dict({"smoothed_states": alone})
-    with pytest.raises(ModelError, match="records must be None, because 'd' is no panel"):
+    with pytest.raises(ModelError, match=r"records must be None without a panel, got \['A'\]"):
         plot_states(alone, records=["A"], backend="none")
 
 
@@ -221,7 +222,7 @@ def test_replicated_observations_of_each_record(known_by):
     )
     for number, label in enumerate(LABELS if known_by else [0, 1]):
         rows = OF_ROWS == LABELS[number]
-        where = {"observable": f"{label}: level"}
+        where = {"record": label, "observable": "level"}
         points = drawn_points(collection, "data", **where)
         np.testing.assert_array_equal(points, np.stack([TIMES[rows], DATA[rows]], axis=1))
         median = collection.get_viz("median", **where).get_ydata()
@@ -268,13 +269,13 @@ def test_long_names_of_records_are_titles_that_touch_nothing(n_records):
         assert not any(box.overlaps(other) for other in boxes[i + 1 :])
 
 
-def test_a_name_longer_than_its_axis_is_a_title():
-    name = "concentration_of_dissolved_oxygen"
+def test_a_name_longer_than_its_axis_has_two_lines():
+    name = "concentration of dissolved oxygen"
     drawn = (("chain", "draw", "d_time", "state"), RNG.normal(size=(2, 20, 5, 1)))
     group = xr.Dataset({"d_states": drawn}, coords={"d_time": np.arange(5.0), "state": [name]})
-    collection = plot_states(xr.DataTree.from_dict({"smoothed_states": group}), backend="none")
-    (title,), (label,) = (
-        [one.item()["string"] for one in collection.viz[kind]["states"]]
-        for kind in ("title", "y_label")
-    )
-    assert (title, label) == (name, "")
+    figure = plot_states(xr.DataTree.from_dict({"smoothed_states": group})).viz["figure"].item()
+    figure.canvas.draw()
+    (axes,) = figure.axes
+    label = axes.yaxis.label
+    assert label.get_text() == "concentration of\ndissolved oxygen"
+    assert label.get_window_extent().height < figure.bbox.height

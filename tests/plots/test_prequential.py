@@ -74,10 +74,10 @@ def test_errors_widen_bands():
 def test_every_backend_draws(backend):
     collection = psf.plot_prequential(NOISY, backend=backend)
     if backend == "none":
-        factor = drawn(collection, "factor_two")["log_bayes_factor"]
+        factor = drawn(collection, "curve", "log_bayes_factor")["two"]
         np.testing.assert_array_equal(factor["x"], ROWS)
         np.testing.assert_allclose(factor["y"], [-1.0, 0.0, 1.0], atol=0.05)
-        score = np.asarray(drawn(collection, "score_two")["score_difference"]["y"])
+        score = np.asarray(drawn(collection, "bar", "score_difference")["two"]["y"])
         np.testing.assert_allclose(score[1::3], [-1.0, 1.0, 1.0], atol=1e-12)
 
 

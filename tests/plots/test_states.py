@@ -174,10 +174,10 @@ def test_panels_and_their_names(states):
     assert [axes.get_ylabel() for axes in figure.axes] == ["position", "speed"]
     assert [axes.get_xlabel() for axes in figure.axes] == ["", "time (s)"]
     key = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert key == ["median", "50 %", "90 %", "data"]
+    assert key == ["90 %", "50 %", "data", "median"]
     unseen = plot_states(states, states="speed").viz["figure"].item()
     assert [axes.get_ylabel() for axes in unseen.axes] == ["speed"]
-    assert [text.get_text() for text in unseen.legends[0].get_texts()] == key[:-1]
+    assert [text.get_text() for text in unseen.legends[0].get_texts()] == ["90 %", "50 %", "median"]
 
 
 def test_many_states():
