@@ -13,6 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ..statistics.axis_lengths import axis_lengths
 from ..statistics.importance import log_mean
 from ..statistics.lower_chains import TOLERATED
 from .estimators.newton import BatchFunction, EdgeError, along, derivatives
@@ -20,7 +21,7 @@ from .posterior import Posterior
 
 N_REPEATED = 40  # fresh estimates of a noisy likelihood
 MIN_MASS = 3.0  # nats, by which the evidence around the peak exceeds that of the draws
-LENGTHS = 4.0 ** -np.arange(24)  # tried for the width of the peak, relative to the draws
+N_QUARTERINGS = 24  # of the widths tried for the peak, from those of the draws on
 MAX_CHANGE = 1.0  # nats, of the log-density along a width
 N_STEPS, STEP = 12, 0.02  # Newton steps; of their differences, in widths
 # Bounds of the curvature that a change of the widths trusts; nearness to one that is trusted.
@@ -63,7 +64,7 @@ def log_mass_at(log_density: BatchFunction, start: Array, spread: Array) -> floa
     below ``spread`` (k,).
     """
     k, point = len(start), start
-    scale = _widths(log_density, start, spread)
+    scale = np.diag(axis_lengths(log_density, start, spread, N_QUARTERINGS, MAX_CHANGE)[1])
     for _ in range(N_STEPS):
         try:
             gradient, hessian = derivatives(along(log_density, point, scale), np.zeros(k), STEP)
@@ -82,14 +83,3 @@ def log_mass_at(log_density: BatchFunction, start: Array, spread: Array) -> floa
         point = moved if values[1] > values[0] else point
         scale = scale @ directions / np.sqrt(size)
     return None
-
-
-def _widths(log_density: BatchFunction, point: Array, spread: Array) -> Array:
-    """A diagonal scale (k, k): the longest moves along the axes that change little, both ways."""
-    k = len(point)
-    moves = (LENGTHS[:, None, None] * np.diag(spread)).reshape(-1, k)
-    values = log_density(np.concatenate([point[None], point + moves, point - moves]))
-    change = np.abs(values[1:] - values[0]).reshape(2, len(LENGTHS), k).max(axis=0)
-    fits = np.logical_and.accumulate((change <= MAX_CHANGE)[::-1])[::-1]
-    longest = np.where(fits.any(axis=0), fits.argmax(axis=0), len(LENGTHS) - 1)
-    return np.diag(spread * LENGTHS[longest])

@@ -9,9 +9,7 @@ import xarray as xr
 from ...errors import DataMismatchError, ModelError
 from ...pymc_model.posterior_draws import COURSE
 from ...smc.merging import merged_log_evidence
-from .selection import prior_weights
-
-N_SIMULATED, SEED = 2000, 0  # of evidences within their errors, for intervals of probabilities
+from .selection import prior_weights, probabilities
 
 
 def compare_rows(
@@ -31,15 +29,14 @@ def compare_rows(
         for name in ("score", "score_se")
     )
     log_weight = value + np.log(prior_weights(model_prior, list(courses)))[:, np.newaxis]
-    simulated = np.random.default_rng(SEED).standard_normal((N_SIMULATED, len(value), 1))
-    ends = (1 - ci_prob) / 2, (1 + ci_prob) / 2
-    low, high = np.quantile(_probabilities(log_weight + error * simulated), ends, axis=0)
+    of_rows = [probabilities(*at, ci_prob) for at in zip(log_weight.T, error.T, strict=True)]
+    probability, low, high = np.moveaxis(np.array(of_rows), 0, -1)
     found = {
         "score_difference": scores - scores[0],
         "score_difference_se": _against_first(score_errors),
         "log_bayes_factor": value - value[0],
         "log_bayes_factor_se": _against_first(error),
-        "probability": _probabilities(log_weight[np.newaxis])[0],
+        "probability": probability,
         "probability_low": low,
         "probability_high": high,
     }
@@ -55,12 +52,6 @@ def _against_first(errors: np.ndarray) -> np.ndarray:
     found = np.hypot(errors, errors[0])
     found[0] = 0.0
     return found
-
-
-def _probabilities(log_evidences: np.ndarray) -> np.ndarray:
-    """Of models along the second axis."""
-    weights = np.exp(log_evidences - log_evidences.max(axis=1, keepdims=True))
-    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
 
 def _courses(results: Mapping[str, Any]) -> dict[str, xr.Dataset]:

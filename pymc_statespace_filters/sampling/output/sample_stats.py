@@ -12,9 +12,11 @@ from ..kernel.state import (
     INDEPENDENT,
     LOG_DENSITY,
     N_COMMON_BLOCKS,
+    N_COUNTS,
     N_EFFECTIVE,
     N_EVALUATIONS,
     N_FAILED,
+    N_NUMBERS,
     N_SCREEN_FAILED,
     N_SCREENED,
     SCALING,
@@ -46,27 +48,17 @@ _SCREEN_COUNTS = {"n_screened": N_SCREENED, "n_screen_failed": N_SCREEN_FAILED}
 
 def dtypes(target: Target) -> dict[str, Any]:
     """Dtypes of the statistics, by name."""
-    dim = target.raveled.dim
-    types: dict[str, Any] = dict.fromkeys(_NUMBERS, np.float64) | dict.fromkeys(_COUNTS, np.int64)
-    types |= {
-        "accept_rate": np.float64,
-        # A float, as in Metropolis: PyMC requires one dtype per name in all steps of a model.
-        "accepted": np.float64,
-        "exact": np.bool_,
-        WARNING: SamplerWarning,
+    dim, n_noisy = target.raveled.dim, len(target.seed_names)
+    counts, seeds = (np.zeros((1, n), dtype=np.int64) for n in (N_COUNTS, n_noisy))
+    one = Draws(
+        np.zeros((1, dim)), np.zeros((1, N_NUMBERS)), counts, seeds, np.zeros((1, dim, dim))
+    )
+    # A subarray dtype is the only way to store a matrix per draw as numbers.
+    types: dict[str, Any] = {
+        name: np.dtype((values.dtype, values.shape[1:]))
+        for name, values in of_draws(target, one, slice(0, 1)).items()
     }
-    if target.samples_all:  # else another DRAM may have another shape, which PyMC refuses
-        # A subarray dtype is the only way to store a matrix per draw as numbers.
-        types["proposal_cov"] = np.dtype((np.float64, (dim, dim)))
-    if target.seed_names:
-        types["n_effective"] = np.float64
-    if target.carries_noise:  # a seed alone does not reproduce the estimate
-        types["correlation"] = np.float64
-    else:
-        types |= dict.fromkeys(target.seed_names, np.int64)
-    if target.screen is not None:
-        types |= dict.fromkeys(_SCREEN_COUNTS, np.int64)
-    return types
+    return types | {"accept_rate": np.float64, WARNING: SamplerWarning}
 
 
 def dtypes_shapes(target: Target) -> dict[str, tuple[Any, Any]]:
@@ -83,13 +75,15 @@ def of_draws(target: Target, draws: Draws, rows: int | slice) -> dict[str, Any]:
     """
     stats = {name: draws.numbers[rows, column] for name, column in _NUMBERS.items()}
     stats |= {name: draws.counts[rows, column] for name, column in _COUNTS.items()}
+    # A float, as in Metropolis: PyMC requires one dtype per name in all steps of a model.
     stats["accepted"] = (stats["stage"] > 0) * 1.0
     stats["exact"] = np.full(stats["stage"].shape, target.exact)
+    # Else another DRAM may have another shape, which PyMC refuses.
     if draws.covs.size and target.samples_all:
         stats["proposal_cov"] = draws.covs[rows].copy()
     if target.seed_names:
         stats["n_effective"] = draws.numbers[rows, N_EFFECTIVE]
-    if target.carries_noise:
+    if target.carries_noise:  # a seed alone does not reproduce the estimate
         stats["correlation"] = np.full(stats["stage"].shape, target.settings.correlation)
     else:
         stats |= {name: draws.seeds[rows, i] for i, name in enumerate(target.seed_names)}

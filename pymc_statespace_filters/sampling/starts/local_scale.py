@@ -6,9 +6,10 @@ The prior may be a million times wider, and a chain at the maximum would then ac
 import numpy as np
 from numpy.typing import NDArray
 
+from ...statistics.axis_lengths import axis_lengths
 from ..target.target import Target
 
-_LENGTHS = 4.0 ** -np.arange(20.0)  # tried along each axis, relative to the prior
+_N_QUARTERINGS = 20  # of the lengths tried along each axis, from those of the prior on
 _MOST_CHANGE = 2.0  # nats, up to a length and at all shorter ones
 
 Array = NDArray[np.float64]
@@ -21,18 +22,14 @@ def local_cov(target: Target, point: Array) -> Array | None:
     """
     if target.is_expensive:
         return None
-    dim = point.size
-    lengths = np.multiply.outer(_LENGTHS, np.sqrt(target.prior_draws.variances()))
-    offsets = (lengths[:, :, np.newaxis] * np.eye(dim)).reshape(-1, dim)
-    points = np.concatenate([point[np.newaxis], point + offsets, point - offsets])
+    rows, largest = target.density.at_rows(), np.sqrt(target.prior_draws.variances())
     try:
-        here, *around = target.density.at_rows()(points)[0]
+        here, longest = axis_lengths(
+            lambda x: rows(x)[0], point, largest, _N_QUARTERINGS, _MOST_CHANGE
+        )
     except Exception as error:
         error.add_note("around the start of a chain, after 0 iterations")
         raise
     if not np.isfinite(here):
         return None
-    changes = np.abs(np.array(around) - here).reshape(2, len(_LENGTHS), dim).max(axis=0)
-    holds = np.logical_and.accumulate((changes <= _MOST_CHANGE)[::-1], axis=0)
-    longest = lengths[::-1][np.maximum(holds.sum(axis=0) - 1, 0), range(dim)]
-    return np.asarray(np.diag(longest**2) * 2.38**2 / dim)
+    return np.asarray(np.diag(longest**2) * 2.38**2 / point.size)
