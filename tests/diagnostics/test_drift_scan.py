@@ -137,12 +137,6 @@ def test_p_values_of_constant_parameters_are_uniform():
     assert min(kstest(column, "uniform").pvalue for column in found.T) > 1e-4
 
 
-@pytest.mark.slow
-def test_p_values_of_many_constant_records_are_uniform():
-    found = p_values_of_constant_records(200, 99)
-    assert min(kstest(column, "uniform").pvalue for column in found.T) > 1e-3
-
-
 def test_a_jump_is_found_with_its_time_and_size():
     scan = drift_scan(Point(), driven_model(jumping(3, to=2.0)), random_seed=1)
     first = scan.iloc[0]

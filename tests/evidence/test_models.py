@@ -151,16 +151,6 @@ def test_the_number_of_threads_changes_no_number(regression_model, monkeypatch):
         assert found[0] == found[1]
 
 
-def test_halves_that_disagree_are_a_warning(regression_model):
-    idata = exact_draws((2, 1000))
-    idata["posterior"]["w"][:, 500:] *= 0.5
-    with (
-        pytest.warns(EvidenceWarning, match="chains disagree"),
-        pytest.warns(EvidenceWarning, match="halves of the draws differ by"),
-    ):
-        chib_jeliazkov(idata, regression_model, random_seed=1)
-
-
 def test_slow_evaluations_have_a_progress_bar(regression_model, monkeypatch):
     bars = []
 

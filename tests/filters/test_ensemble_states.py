@@ -289,18 +289,6 @@ def test_two_wells(moment):
     assert np.sqrt((ensemble[0] ** 2).mean()) > 0.4
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("moment", ["filtered", "smoothed"])
-def test_errors_of_particles_fall_with_the_root_of_their_number(moment):
-    sizes = np.array([250, 1000, 4000])
-    rms = [
-        np.sqrt((double_well_errors(psf.BootstrapPF(int(N)), moment, 32)[0] ** 2).mean())
-        for N in sizes
-    ]
-    slope, _ = np.polyfit(np.log(sizes), np.log(rms), 1)
-    assert -0.6 < slope < -0.4
-
-
 def test_particles_are_chosen_by_weight_and_density():
     """Proposals that are accepted, and full sweeps where none is, give one law.
 

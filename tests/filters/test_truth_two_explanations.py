@@ -78,31 +78,6 @@ def test_moments_of_the_weighted_particles_are_exact_in_the_mean(sensor, n_steps
     check_moments(sensor, n_steps, n_particles, 2000)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("n_particles", [2, 8])
-@pytest.mark.parametrize("n_steps", [1, 20])
-@pytest.mark.parametrize("sensor", SENSORS)
-def test_moments_with_many_seeds(sensor, n_steps, n_particles):
-    check_moments(sensor, n_steps, n_particles, 50_000)
-
-
-@pytest.mark.parametrize(
-    ("sensor", "n_steps", "n_particles"), [("sin", 1, 3), ("sin", 20, 3), ("abs", 20, 8)]
-)
-def test_mean_of_the_likelihood_is_exact(sensor, n_steps, n_particles):
-    """Three and a half standard errors: three right filters fail once in eight hundred sets."""
-    symbolic, numeric = SENSORS[sensor]
-    (exact,) = exact_moments(numeric, OBSERVED[sensor], FUNCTIONS[:1])
-    record = {"observed": OBSERVED[sensor], "steps": n_steps * np.arange(1, 4)}
-    found = np.exp(log_likelihoods(
-        walk_seen_through(symbolic, n_steps), psf.GuidedPF(n_particles), {}, np.arange(5_000),
-        **record,
-    ))  # fmt: skip
-    error = found.std() / np.sqrt(found.size)
-    assert error < 0.1 * exact
-    assert abs(found.mean() - exact) < 3.5 * error
-
-
 def test_stored_normals_give_what_their_seed_gives():
     """The pilot's noise is neither stored nor of the filter's seed."""
     system, filter = walk_seen_through(pt.sin), psf.GuidedPF(100)

@@ -1,7 +1,6 @@
 """`StateSpace(panel=)`: the log-density, gradient and draws of many records in one variable."""
 
 import arviz as az
-import cloudpickle
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
@@ -195,12 +194,6 @@ def test_own_parameters_of_another_number_of_records_are_refused():
         density({"a": A})
 
 
-def test_copies_keep_the_density():
-    model = model_of(PARTICLES)
-    copy = cloudpickle.loads(cloudpickle.dumps(model))
-    np.testing.assert_array_equal(terms_of(copy), terms_of(model))
-
-
 def test_batches_of_parameters_are_batches_of_panels():
     model = model_of()
     many = np.stack([A, A + 0.1])
@@ -235,12 +228,6 @@ def test_steps_half_as_long_are_those_of_every_record():
 
     alone = [finest(rows) for rows in RECORDS.slices()]
     np.testing.assert_allclose(finest(slice(None), panel=LABELS), sum(alone), rtol=1e-12)
-
-
-def test_draws_are_the_same_in_every_mode():
-    variable = model_of(observed=None, inputs=OWN_FORCES)["d"]
-    draws = [pm.draw(variable, 2, random_seed=3, mode=mode) for mode in ("NUMBA", "FAST_COMPILE")]
-    np.testing.assert_array_equal(*draws)
 
 
 def test_a_record_never_seen_has_parameters_of_the_population():

@@ -243,13 +243,6 @@ def test_a_chain_that_stands_still_says_so(caplog):
     assert caplog.text.count("accepted 0 of 100 proposals") == 2
 
 
-def test_a_mode_without_machine_code():
-    with simple_model():
-        slow = DRAM(compile_kwargs={"mode": "FAST_COMPILE"})
-        fast, reference = sample(slow, draws=20, tune=20), sample(DRAM(), draws=20, tune=20)
-    np.testing.assert_allclose(fast["posterior"]["mu"], reference["posterior"]["mu"], rtol=1e-8)
-
-
 def test_live_columns():
     """Every column has a first value, and a draw's statistics fill all of them."""
     with simple_model() as model:
