@@ -144,17 +144,6 @@ def test_a_guided_filter_is_exact_too():
     assert found == pytest.approx(exact_terms().sum(), abs=1e-9)
 
 
-def test_the_bootstrap_filter_has_the_likelihood_as_its_mean():
-    """Right implementations fail one time in 16000."""
-    times, rng = TIMES[:8], np.random.default_rng(3)
-    data = psf.simulate(EXACT, THETA, times=times, random_seed=rng)["observations"].values
-    settings = {"times": times, "seed": np.arange(60)}
-    found = psf.log_likelihood(EXACT, psf.BootstrapPF(500), THETA, data, **settings).sum(axis=1)
-    ratios = np.exp(found - exact_terms(times, data[:, 0]).sum())
-    assert abs(ratios.mean() - 1) < 4 * ratios.std() / np.sqrt(60)
-    assert ratios.std() < 0.5
-
-
 @pytest.mark.parametrize("stiff", [1.0, 200.0])
 def test_an_exact_step_of_any_length_is_that_of_a_grid(stiff):
     """Two states and an offset; each time is on the grid of one system alone."""
