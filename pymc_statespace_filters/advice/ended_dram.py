@@ -2,7 +2,7 @@
 
 from functools import partial
 
-from ..checks.filters.facts import UsedFilters
+from ..checks.filters.filter_facts import UsedFilters
 from ..parallel.signals import is_interrupted
 from ..pymc_model.missing_codes import has_missing_codes
 from ..sampling.output.datatree import most_iterations

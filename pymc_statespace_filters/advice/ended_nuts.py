@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..checks.filters.facts import UsedFilters
+from ..checks.filters.filter_facts import UsedFilters
 from ..parallel.signals import is_interrupted
 from ..pymc_model.missing_codes import has_missing_codes
 from ..sampling.nuts.chains import TOLERATED

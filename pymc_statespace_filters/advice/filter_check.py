@@ -5,10 +5,10 @@ from typing import NamedTuple
 from xarray import DataTree
 
 from ..checks.filters.checks import MORE_POINTS, check_at_end, doubts, store, stored
-from ..checks.filters.facts import FilterOutcomes, UsedFilters
+from ..checks.filters.filter_facts import FilterOutcomes, UsedFilters
 from ..checks.filters.finding import EXACT, OFF
 from ..errors import StateSpaceFiltersError
-from ..evidence.facts import CorrectingFilter, FiltersOfDraws
+from ..evidence.evidence_facts import CorrectingFilter, FiltersOfDraws
 from ..parallel.shared_rows import by_first_rank
 from ..parallel.signals import unless_interrupted
 from ..pymc_model.inspection import observes_state_space

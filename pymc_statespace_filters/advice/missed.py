@@ -4,7 +4,7 @@ import numpy as np
 
 from ..checks.coverage.check import MOST_PARAMETERS
 from ..checks.coverage.sentences import store, stored, unvisited
-from ..evidence.facts import PartsOfPosterior
+from ..evidence.evidence_facts import PartsOfPosterior
 from ..parallel.shared_rows import by_first_rank
 from ..parallel.signals import unless_interrupted
 from ..pymc_model.density import ModelDensity

@@ -26,12 +26,12 @@ from ..pymc_model.prior import Support
 from .agreement import chosen_estimator
 from .checks import check_convergence, check_discretisation
 from .estimators.importance import Importance
-from .estimators.maximum_likelihood import N_EVALUATIONS, max_log_likelihood
+from .estimators.largest_likelihood import N_EVALUATIONS, max_log_likelihood
 from .estimators.protocol import Estimate, Estimator
 from .evidence import Evidence, store_evidence
+from .evidence_facts import CorrectingFilter, FiltersOfDraws, PartsOfPosterior
 from .exact_density import ExactDensity
 from .exchangeable_labels import OneOrder, undeclared_labels
-from .facts import CorrectingFilter, FiltersOfDraws, PartsOfPosterior
 from .observed_data import data_fingerprint, observation_count
 from .posterior import Posterior
 from .posterior_of_draws import build_posterior

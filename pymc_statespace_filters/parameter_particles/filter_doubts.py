@@ -6,12 +6,12 @@ import pymc as pm
 import xarray as xr
 
 from ..checks.filters.checks import kept, store
-from ..checks.filters.facts import FilterOutcomes, UsedFilters
+from ..checks.filters.filter_facts import FilterOutcomes, UsedFilters
 from ..facts import tell
 from ..filters.protocol import Filter
 from ..parallel.shared_rows import by_first_rank
 from .output import DoubtsOf
-from .request import Request
+from .particle_request import Request
 
 _CHECK = 2**32 + 2  # key of random numbers beside those of the run
 

@@ -28,7 +28,7 @@ from ..sampling.target.variables import RaveledVariables
 from ..smc.merging import mean_and_error, merged_index, merged_log_evidence
 from ..smc.particles import Particles
 from ..statistics.importance import normalised
-from .request import Request, Run, least_alive
+from .particle_request import Request, Run, least_alive
 
 ESTIMATOR = "smc"
 ERRORS = "mcse"

@@ -10,7 +10,7 @@ import xarray as xr
 
 from ..compiler.native.compilation import COMPILATION
 from ..errors import ModelError
-from ..evidence.estimators.maximum_likelihood import max_log_likelihood
+from ..evidence.estimators.largest_likelihood import max_log_likelihood
 from ..evidence.observed_data import observed_in
 from ..evidence.posterior import Posterior
 from ..filters.protocol import Filter
@@ -26,7 +26,7 @@ from ..system.checks import check_flag, check_random_seed
 from .filter_doubts import checked_at_end, not_checked
 from .observed_rows import ObservedRows
 from .output import DoubtsOf, as_datatree
-from .request import Request, Run, checked_request
+from .particle_request import Request, Run, checked_request
 from .sequential_output import finished
 from .sequential_run import Progress
 from .stored_run import progress_of_arrays

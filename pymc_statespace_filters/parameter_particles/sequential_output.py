@@ -13,7 +13,7 @@ from ..progress import stage_progress
 from ..pymc_model.posterior_draws import COURSE, SEQUENTIAL
 from .observed_rows import ObservedRows
 from .output import DoubtsOf, as_datatree
-from .request import Request
+from .particle_request import Request
 from .sequential_run import Progress, advance
 from .stored_run import GROUP, arrays_of_progress, stored
 from .stored_steps import StoredSteps

@@ -25,9 +25,9 @@ from ..smc.bridge import Cloud, Crossed, Stage, cross, sizes_of_evidence
 from ..smc.merging import merged_scores
 from ..smc.particles import Populations
 from ..statistics.importance import systematic
-from .calibration import transform_of_row
 from .observed_rows import ObservedRows, exchanged, exchanging
-from .request import Request, Run, check_alive, least_alive
+from .particle_request import Request, Run, check_alive, least_alive
+from .row_calibration import transform_of_row
 
 MAX_VARIANCE = 2.0  # of the log-likelihood at fixed parameters; beyond it members are doubled
 N_POINTS, N_REPEATS = 8, 8  # at and by which it is measured

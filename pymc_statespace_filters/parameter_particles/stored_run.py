@@ -28,7 +28,7 @@ from ..smc.particles import Particles, Populations
 from ..system.clock import Clock
 from ..system.graph_digest import described, digest, graph_digest
 from .observed_rows import ObservedRows
-from .request import Request
+from .particle_request import Request
 from .sequential_run import Progress, RowCourse, n_members
 
 GROUP = "smc_state"

@@ -8,7 +8,7 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
-from ..checks.coverage.modes import LEAST_EVALUATIONS, Visited, joined, missed_mode, thinned
+from ..checks.coverage.missed_modes import LEAST_EVALUATIONS, Visited, joined, missed_mode, thinned
 from ..checks.coverage.sentences import sentence_of_mode
 from ..filters.protocol import Filter
 from ..parallel.signals import interrupts_are_noted
@@ -16,7 +16,7 @@ from ..pymc_model.other_filter import model_with
 from ..pymc_model.prior import ModelFactors
 from ..smc.bridge import Cloud, Crossed, Stage, cross
 from ..smc.particles import Evaluate, Particles
-from .request import Request, Run, check_alive
+from .particle_request import Request, Run, check_alive
 from .stored_run import arrays_of_cloud, cloud_of_arrays
 from .stored_steps import StoredSteps
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evidence.estimators.maximum_likelihood import maximize_noisy
+from ..evidence.estimators.largest_likelihood import maximize_noisy
 from ..evidence.estimators.newton import BatchFunction, EdgeError
 from ..sampling.starts.annealing import Population
 from ..statistics.importance import log_mean_of_independent

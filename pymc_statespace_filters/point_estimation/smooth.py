@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from ..evidence.estimators.maximum_likelihood import maximize_along_edge
+from ..evidence.estimators.largest_likelihood import maximize_along_edge
 from ..evidence.estimators.newton import (
     BatchFunction,
     EdgeError,

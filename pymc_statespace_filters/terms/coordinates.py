@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .density import Array, Columns, SubmodelDensity
+from .submodel_density import Array, Columns, SubmodelDensity
 
 POWERS = np.linspace(0.0, 1.0, 5)
 

@@ -10,9 +10,9 @@ from pytensor.graph.traversal import ancestors
 
 from ..errors import ModelError
 from .candidates import Candidates
-from .density import Array, Point, SubmodelDensity
-from .estimates import LEAST_EFFECTIVE, Visits, Weighted
 from .probabilities import Probabilities
+from .submodel_density import Array, Point, SubmodelDensity
+from .submodel_evidence import LEAST_EFFECTIVE, Visits, Weighted
 
 MAX_SHARE = 0.01  # of the probability, in sub-models of unreliable evidence
 MOST_APART, LEAST_APART = 4.0, 0.02  # of visits and probabilities: errors, and at least

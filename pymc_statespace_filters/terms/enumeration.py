@@ -10,13 +10,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from .candidates import Candidates
-from .density import Array, Sets
 from .doubts import check_finite
-from .estimates import Sampler, Weighted
 from .inclusion import InclusionPrior
 from .probabilities import Probabilities
 from .proposals import Guide
 from .screening import N_SCREENED, Announce, improved, screened
+from .submodel_density import Array, Sets
+from .submodel_evidence import Sampler, Weighted
 
 FEWEST = 100  # points of a sub-model within reach
 LARGE, ENOUGH = (

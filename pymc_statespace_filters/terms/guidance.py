@@ -9,10 +9,10 @@ proposal is fitted again, and points by weight take the place of the draws.
 import numpy as np
 
 from ..evidence.estimators.student_mixture import flattened
-from .density import SubmodelDensity
-from .estimates import Sampler, Weighted
 from .proposals import Guide
 from .screening import N_PILOT, Announce, improved, is_worthless
+from .submodel_density import SubmodelDensity
+from .submodel_evidence import Sampler, Weighted
 
 # Effective points per point of the full model, below which the draws are replaced. Draws of the
 # posterior have 0.1 to 0.6; those that are off by six standard deviations 0.005

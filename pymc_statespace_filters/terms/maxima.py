@@ -13,9 +13,9 @@ import numpy as np
 
 from ..evidence.estimators.newton import BatchFunction, EdgeError, derivatives
 from ..statistics.student_mixture import StudentMixture
-from .density import Array, Columns, SubmodelDensity
-from .estimates import Sampler
 from .proposals import FIRST, WIDE, Guide, Proposal
+from .submodel_density import Array, Columns, SubmodelDensity
+from .submodel_evidence import Sampler
 
 STEP = 0.01  # of differences, in standard deviations
 N_STEPS = 20  # of Newton's method, at most

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from ..statistics.importance import normalised
-from .density import Array, Sets
+from .submodel_density import Array, Sets
 
 
 @dataclass(frozen=True)

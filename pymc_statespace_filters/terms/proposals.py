@@ -28,7 +28,7 @@ from ..statistics.student_mixture import (
     standardised,
 )
 from .coordinates import Coordinates, fitted_coordinates
-from .density import Array, Columns, Sets, SubmodelDensity
+from .submodel_density import Array, Columns, Sets, SubmodelDensity
 
 MOST_FITTED = 4000  # draws
 MOST_COMPONENTS, MIN_GAIN = 6, 0.02  # of the mixture; nats per held-out draw for one more

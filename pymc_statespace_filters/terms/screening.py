@@ -10,9 +10,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from .density import Array
-from .estimates import Sampler, Weighted
 from .proposals import Proposal
+from .submodel_density import Array
+from .submodel_evidence import Sampler, Weighted
 
 N_SCREENED = 25  # points of every sub-model
 MOST_SCREENED = 20_000  # points of all sub-models that are drawn again, unless 25 each are more

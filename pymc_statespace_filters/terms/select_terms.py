@@ -18,18 +18,18 @@ from ..pymc_model.inspection import given_model
 from ..pymc_model.posterior_draws import check_one_model, posterior_group
 from ..sampling import sample
 from ..system.checks import check_random_seed
+from .averaged_draws import averaged
 from .candidates import read_candidates
-from .chain import MOST_MENDED, run_chains
-from .density import SubmodelDensity
 from .doubts import check_distinct, check_finite, doubts, doubts_of_potentials
-from .draws import averaged
 from .enumeration import estimate_all, probabilities, until_certain, with_lighter_tails
-from .estimates import Sampler
 from .guidance import NO_GUIDE, checked_guide
 from .inclusion import BETA_BINOMIAL, MOST_COUNTED, read_inclusion
 from .maxima import Maxima
 from .proposals import Guide
-from .result import as_datatree
+from .submodel_chains import MOST_MENDED, run_chains
+from .submodel_density import SubmodelDensity
+from .submodel_evidence import Sampler
+from .terms_tree import as_datatree
 
 
 @shared_by_ranks

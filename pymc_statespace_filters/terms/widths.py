@@ -18,10 +18,10 @@ from pytensor.graph.traversal import ancestors
 from scipy.stats import norm
 
 from ..evidence.comparison.width_curves import dataset_of_curves
-from .density import Array, SubmodelDensity
 from .doubts import unreliable
-from .estimates import Weighted
 from .probabilities import Probabilities
+from .submodel_density import Array, SubmodelDensity
+from .submodel_evidence import Weighted
 
 MAX_SHARE = 0.05  # of the probability, in sub-models whose points do not know it
 CI_PROB = 0.95

@@ -11,7 +11,7 @@ import pytest
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence import Evidence, compare_evidence
-from pymc_statespace_filters.evidence.comparison.table import EvidenceTable
+from pymc_statespace_filters.evidence.comparison.evidence_table import EvidenceTable
 
 
 def evidence(log_evidence, se=0.05, k=2, max_log_likelihood=-5.0, **fields):

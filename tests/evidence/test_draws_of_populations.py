@@ -13,7 +13,7 @@ from pymc_statespace_filters.advice import missed
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence import estimation
 from pymc_statespace_filters.evidence.comparison.scaled_prior import average_ratios
-from pymc_statespace_filters.evidence.facts import PartsOfPosterior
+from pymc_statespace_filters.evidence.evidence_facts import PartsOfPosterior
 from pymc_statespace_filters.evidence.pooled import Pooled
 from pymc_statespace_filters.evidence.posterior import Posterior
 from pymc_statespace_filters.evidence.reweighting.correction import correct

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import norm
 
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.estimators.maximum_likelihood import (
+from pymc_statespace_filters.evidence.estimators.largest_likelihood import (
     N_EVALUATIONS,
     N_VALUING,
     max_log_likelihood,

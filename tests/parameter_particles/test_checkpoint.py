@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.checks.coverage.modes import MissedMode
+from pymc_statespace_filters.checks.coverage.missed_modes import MissedMode
 from pymc_statespace_filters.errors import DataMismatchError
 from pymc_statespace_filters.parameter_particles import stored_steps, whole_data
 from pymc_statespace_filters.parameter_particles.observed_rows import ObservedRows

@@ -15,7 +15,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.parameter_particles import whole_data
 from pymc_statespace_filters.parameter_particles.output import _doubts
-from pymc_statespace_filters.parameter_particles.request import Run, check_alive
+from pymc_statespace_filters.parameter_particles.particle_request import Run, check_alive
 from pymc_statespace_filters.pymc_model.density import ModelDensity
 from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
 from pymc_statespace_filters.smc.bridge import Cloud

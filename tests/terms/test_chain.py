@@ -9,15 +9,15 @@ import pytest
 import xarray as xr
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.terms import chain
+from pymc_statespace_filters.terms import submodel_chains
 from pymc_statespace_filters.terms.candidates import read_candidates
-from pymc_statespace_filters.terms.density import SubmodelDensity
 from pymc_statespace_filters.terms.doubts import doubts
-from pymc_statespace_filters.terms.estimates import Sampler, Visits
 from pymc_statespace_filters.terms.inclusion import InclusionPrior
 from pymc_statespace_filters.terms.maxima import Maxima, proposal_by
 from pymc_statespace_filters.terms.probabilities import Probabilities
 from pymc_statespace_filters.terms.proposals import Guide
+from pymc_statespace_filters.terms.submodel_density import SubmodelDensity
+from pymc_statespace_filters.terms.submodel_evidence import Sampler, Visits
 from tests.terms.regression import Regression
 
 LOG_POSTERIOR = np.log([[0.2, 0.05], [0.3, 0.45]])  # by the presence of two terms
@@ -44,11 +44,11 @@ class NoisyHeights:
 def test_visits_are_as_frequent_as_probable(sd, monkeypatch):
     """Whatever the noise of the estimates. Fails by chance once in 4000."""
     rng = np.random.default_rng(3)
-    monkeypatch.setattr(chain, "_Met", lambda *args: NoisyHeights(sd, rng))
-    monkeypatch.setattr(chain, "N_STEPS", 8000)
+    monkeypatch.setattr(submodel_chains, "_Met", lambda *args: NoisyHeights(sd, rng))
+    monkeypatch.setattr(submodel_chains, "N_STEPS", 8000)
     prior = InclusionPrior(None, np.zeros((2, 2), dtype=bool))
     guide = SimpleNamespace(distances=np.array([1.5, 2.5]))
-    visits = chain.run_chains(prior, guide, None, rng, lambda task, total: None)
+    visits = submodel_chains.run_chains(prior, guide, None, rng, lambda task, total: None)
     assert (visits.error < 0.01).all()
     np.testing.assert_array_less(abs(visits.frequency - INCLUSION), 4 * visits.error)
     assert not visits.alone.any()
@@ -94,15 +94,15 @@ def test_what_was_not_met_is_part_of_the_error(monkeypatch):
     """Of 2^16 sub-models, a few hundred: by evidences without error, of 12 runs."""
     inclusion = np.concatenate([np.full(8, 0.05), np.full(8, 0.2)])
     log_odds = np.log(inclusion / (1 - inclusion))
-    monkeypatch.setattr(chain, "N_STEPS", 400)
+    monkeypatch.setattr(submodel_chains, "N_STEPS", 400)
     prior = InclusionPrior(None, np.zeros((16, 16), dtype=bool))
     guide = SimpleNamespace(distances=np.linspace(0, 3, 16))
     z, shares = [], []
     for seed in range(12):
         met = Independent(log_odds)
-        monkeypatch.setattr(chain, "_Met", lambda *args, met=met: met)
+        monkeypatch.setattr(submodel_chains, "_Met", lambda *args, met=met: met)
         rng = np.random.default_rng(seed)
-        visits = chain.run_chains(prior, guide, None, rng, lambda task, total: None)
+        visits = submodel_chains.run_chains(prior, guide, None, rng, lambda task, total: None)
         found = Probabilities(
             visits.sets, visits.sets @ log_odds, *np.zeros((2, len(visits.sets)))
         ).inclusion
@@ -185,7 +185,7 @@ def test_chains_that_learn_where_sub_models_are(monkeypatch):
     """The draws say little, the chains start with no term, and the probabilities are exact."""
     monkeypatch.setattr(SELECT, "MOST_COUNTED", 3)
     monkeypatch.setattr(SELECT, "NO_GUIDE", 1.1)  # whatever the draws are
-    monkeypatch.setattr(chain, "N_STEPS", 300)
+    monkeypatch.setattr(submodel_chains, "N_STEPS", 300)
     regression = Regression(3, n_terms=4)
     rng = np.random.default_rng(7)
     b = 2 + 0.1 * rng.standard_normal((4, 2, 300))

@@ -9,8 +9,8 @@ from scipy.stats import norm
 from pymc_statespace_filters.statistics.importance import log_mean_of_independent
 from pymc_statespace_filters.terms import enumeration, screening
 from pymc_statespace_filters.terms.candidates import read_candidates
-from pymc_statespace_filters.terms.estimates import Weighted
 from pymc_statespace_filters.terms.probabilities import Probabilities
+from pymc_statespace_filters.terms.submodel_evidence import Weighted
 
 
 def test_more_points_are_never_more_than_are_left():

@@ -15,10 +15,10 @@ from scipy.stats import multivariate_normal
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
 from pymc_statespace_filters.evidence.evidence import Evidence, store_evidence
-from pymc_statespace_filters.terms import chain, enumeration
+from pymc_statespace_filters.terms import enumeration, submodel_chains
 from pymc_statespace_filters.terms.candidates import read_candidates
-from pymc_statespace_filters.terms.estimates import Visits
 from pymc_statespace_filters.terms.inclusion import read_inclusion
+from pymc_statespace_filters.terms.submodel_evidence import Visits
 from tests.terms.regression import Regression
 
 
@@ -463,7 +463,7 @@ def draws_of_values(values):
 def test_chains_over_sub_models_agree_with_all_of_them(monkeypatch):
     function = sys.modules["pymc_statespace_filters.terms.select_terms"]
     monkeypatch.setattr(function, "MOST_COUNTED", 3)
-    monkeypatch.setattr(chain, "N_STEPS", 400)
+    monkeypatch.setattr(submodel_chains, "N_STEPS", 400)
     missed = Visits.missed
     monkeypatch.setattr(Visits, "missed", lambda *given: np.hypot(missed(*given), 0.01))
     regression = few_terms()
@@ -503,7 +503,7 @@ def test_draws_from_which_nothing_is_found_are_doubted():
 def test_chains_with_draws_of_another_law(monkeypatch):
     function = sys.modules["pymc_statespace_filters.terms.select_terms"]
     monkeypatch.setattr(function, "MOST_COUNTED", 3)
-    monkeypatch.setattr(chain, "N_STEPS", 300)
+    monkeypatch.setattr(submodel_chains, "N_STEPS", 300)
     regression = few_terms()
     model = regression.model(as_system=False)
     terms = selected(regression, model, idata=poor_draws(0.0, 3.0), random_seed=1)["terms"]

@@ -6,8 +6,8 @@ phase. Chains in one of such modes agree, and estimates of the evidence from the
 points are evaluated where a copy may lie: the best draw with elements reflected or exchanged, and
 lines from it along each element, as wide as its prior, on which the peaks are approached. Where the
 density at such a point is far above that of a mixture fitted to the draws, its surroundings are
-explored, and the integral over them is compared with the draws there, as in `modes`. A place that
-the density does not fall before belongs to the mode of the draws, and is no copy.
+explored, and the integral over them is compared with the draws there, as in `missed_modes`. A place
+that the density does not fall before belongs to the mode of the draws, and is no copy.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from ...smc.kernel import fitted_mixture
 from ...statistics.importance import LogMean, mcse_of_chains
 from ...statistics.student_mixture import StudentMixture, standardised
 from .check import bridged
-from .modes import MIN_EXCESS, N_PLACES, SIZES, MissedMode, Place, compared, explored
+from .missed_modes import MIN_EXCESS, N_PLACES, SIZES, MissedMode, Place, compared, explored
 from .tail_proposals import Evaluate
 
 N_FITTED, N_BRIDGE = 1000, 500  # draws of the mixture; points of the evidence

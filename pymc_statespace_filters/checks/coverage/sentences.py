@@ -17,7 +17,7 @@ from ...pymc_model.elements import element_names, places_in_vector
 from . import ALL_MODES
 from .check import MissedTail, missed_tails
 from .copies import missed_copy
-from .modes import MissedMode
+from .missed_modes import MissedMode
 from .tail_proposals import Evaluate
 
 ATTRIBUTE = "unvisited"  # of results, a JSON text

@@ -31,9 +31,9 @@ from ..comparison.scaled_prior import UNCHANGED, UNKNOWN, ScaledPrior
 from ..comparison.selection import check_ci_prob, prior_weights, probabilities
 from ..comparison.width_curves import curves_of_models, dataset_of_curves, width_factors
 from ..posterior_of_draws import build_posterior, reproducing_seeds
+from .drift_table import DriftTable, sentences
 from .marginal import ConstantModel
 from .strengths import chosen_strengths
-from .table import DriftTable, sentences
 
 MODELS = ["constant", "drifting"]
 

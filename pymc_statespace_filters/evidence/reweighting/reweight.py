@@ -23,8 +23,8 @@ from ...pymc_model.other_filter import model_of_draws
 from ...pymc_model.posterior_draws import MIN_DRAWS, noise_was_moved, posterior_group
 from ...statistics.importance import MIN_EFFECTIVE, largest_good_k, pareto_k
 from ...system.checks import check_count, check_random_seed, is_integer
+from ..evidence_facts import CorrectingFilter
 from ..exact_density import ExactDensity
-from ..facts import CorrectingFilter
 from ..posterior_of_draws import build_posterior
 from .correction import MOST_ESTIMATES, Correction, correct, seeds_needed
 from .result import reweighted_tree

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from pymc_statespace_filters.checks.coverage import modes
-from pymc_statespace_filters.checks.coverage.modes import (
+from pymc_statespace_filters.checks.coverage import missed_modes
+from pymc_statespace_filters.checks.coverage.missed_modes import (
     SIZES,
     Visited,
     _integrated,
@@ -144,8 +144,10 @@ def test_it_evaluates_no_more_points_than_it_may():
 
 def test_the_mixture_is_fitted_to_no_more_draws_than_there_are_particles(monkeypatch):
     """Copies of particles would hide how few there are."""
-    fitted, fit = [], modes.fitted_mixture
-    monkeypatch.setattr(modes, "fitted_mixture", lambda x, rng: fitted.append(x) or fit(x, rng))
+    fitted, fit = [], missed_modes.fitted_mixture
+    monkeypatch.setattr(
+        missed_modes, "fitted_mixture", lambda x, rng: fitted.append(x) or fit(x, rng)
+    )
     looked(0.3, 1)
     (draws,) = fitted
     assert len(draws.z) == R * N

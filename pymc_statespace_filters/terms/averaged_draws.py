@@ -8,8 +8,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..statistics.importance import normalised, systematic
-from .density import Array, Seeds, Sets, SubmodelDensity
-from .estimates import Weighted
+from .submodel_density import Array, Seeds, Sets, SubmodelDensity
+from .submodel_evidence import Weighted
 
 
 class Averaged(NamedTuple):

@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Self
 import pandas as pd
 import xarray as xr
 
-from ..comparison.table import EvidenceTable
+from ..comparison.evidence_table import EvidenceTable
 
 
 class DriftTable(EvidenceTable):

@@ -26,12 +26,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..statistics.importance import mcse_of_chains
-from .density import Array, Sets
-from .estimates import Sampler, Visits, Weighted
 from .inclusion import InclusionPrior
 from .maxima import Maxima, Maximum, proposal_by
 from .proposals import Guide
 from .screening import GOOD, REACH, Announce, improved, screened
+from .submodel_density import Array, Sets
+from .submodel_evidence import Sampler, Visits, Weighted
 
 N_CHAINS, N_STEPS, N_DROPPED = 4, 1000, 200  # the first steps are dropped
 STARTS = (1.0, 2.0, 3.0)  # standard deviations from where a term vanishes, to be present at first

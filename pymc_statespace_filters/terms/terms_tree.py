@@ -8,12 +8,12 @@ import xarray as xr
 from ..evidence.comparison.width_curves import width_factors
 from ..pymc_model.inspection import exactness, filters_used
 from ..pymc_model.posterior_draws import AVERAGED
+from .averaged_draws import Averaged, posterior_of
 from .candidates import Candidates
-from .density import Sets, SubmodelDensity
-from .draws import Averaged, posterior_of
-from .estimates import LEAST_EFFECTIVE, Visits, Weighted
 from .inclusion import Restriction
 from .probabilities import Probabilities
+from .submodel_density import Sets, SubmodelDensity
+from .submodel_evidence import LEAST_EFFECTIVE, Visits, Weighted
 from .widths import inclusion_by_width
 
 LEAST_SHOWN = 1e-4  # probability of a sub-model whose weights are looked at

@@ -24,8 +24,8 @@ from ..statistics.importance import (
     log_mean_of_independent,
     pareto_k,
 )
-from .density import Array, Point, Seeds, Sets, SubmodelDensity
 from .proposals import Proposal
+from .submodel_density import Array, Point, Seeds, Sets, SubmodelDensity
 
 LEAST_EFFECTIVE = MIN_EFFECTIVE / 2  # points of a sub-model whose error can be believed
 LEAST_FOR_TAIL = 25  # weights to which a Pareto tail is fitted
