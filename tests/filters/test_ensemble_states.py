@@ -6,7 +6,6 @@ any finite number has. A right filter fails that once in a million times the num
 """
 
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 import pytensor.tensor as pt
@@ -24,7 +23,7 @@ from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.system.parameters import flat_parameters
 from tests.compiled import from_python
-from tests.filters.test_ekf_states import assert_drawn_from
+from tests.filters.test_ekf_states import States, assert_drawn_from
 from tests.references.grid_states import GridStates
 from tests.references.linear_states import linear_states
 from tests.references.records import BROAD_DOUBLE_WELL, broad_double_well
@@ -56,14 +55,6 @@ SWING = psf.StateSpaceModel(
 )
 LONG_STEPS = np.arange(1, 31)
 LONG_DATA = np.cos(0.3 * LONG_STEPS)[:, None] + 0.4 * np.sin(1.7 * LONG_STEPS)[:, None]
-
-
-class States(NamedTuple):
-    mean: np.ndarray
-    sd: np.ndarray
-    drawn: np.ndarray
-    n_effective: np.ndarray
-    health: np.ndarray
 
 
 @cache

@@ -1,7 +1,6 @@
 """States of the point-mass filter against exact answers, and against sums on a grid of our own."""
 
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -13,6 +12,8 @@ from pymc_statespace_filters.compiler.lowering.compiled_system import compile_sy
 from pymc_statespace_filters.filters.outcomes import NONE, TOO_FAR
 from pymc_statespace_filters.filters.point_mass.moments import draw
 from pymc_statespace_filters.system.parameters import flat_parameters
+from tests.filters.test_ekf_states import States
+from tests.filters.test_grid import linear
 from tests.references.grid import PointMassFilter
 from tests.references.grid_states import GridStates
 from tests.references.linear_states import linear_states
@@ -29,14 +30,6 @@ from tests.systems import DOUBLE_WELL_SYSTEM, FORCE, FORCED, FORCED_DATA, double
 from tests.systems import STEPS as FORCED_STEPS
 
 MOMENTS = ("predicted", "filtered", "smoothed")
-
-
-class States(NamedTuple):
-    mean: np.ndarray
-    sd: np.ndarray
-    drawn: np.ndarray
-    n_effective: np.ndarray
-    health: np.ndarray
 
 
 @cache
@@ -74,19 +67,6 @@ def assert_law(found, mean, sd, atol):
     np.testing.assert_allclose(found.sd, sd, rtol=0.0, atol=atol)
     assert (found.n_effective == np.inf).all()
     np.testing.assert_array_equal(found.health, [np.inf, NONE, -1.0])
-
-
-def linear(growth, noise, sensor, spread, start=0.4):
-    """x' = growth x + N(0, noise^2), seen with an error of this deviation."""
-    dt = DoubleWell.dt
-    return DoubleWell(
-        alpha=(growth - 1.0) / dt,
-        beta=0.0,
-        sigma=noise / np.sqrt(dt),
-        noise_var=sensor**2,
-        initial_mean=start,
-        initial_var=spread**2,
-    )
 
 
 def linear_law(system, steps, observed, rows, moment):
