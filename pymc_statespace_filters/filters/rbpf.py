@@ -30,10 +30,10 @@ from .iplf import IPLF
 from .outcomes import NONE, is_missing
 from .plan import NULL, PLAN, call_members, propagate
 from .protocol import System
+from .regimes.backward_simulation import SMOOTH_PARTICLES
 from .regimes.checks import check_hybrid, check_inner
 from .regimes.hybrid import hybrid_of
 from .regimes.moves import moves_of_parts
-from .regimes.particle_states import SMOOTH_MIXTURE
 from .regimes.particles import HybridParticles, hybrid_particles
 from .state_law import Layout
 from .ukf import UKF
@@ -227,7 +227,7 @@ class RBPF(ParticleFilter):
     def smoother(self, system: System) -> Plan:
         """Plan backward simulation."""
         moves = moves_of_parts(system.written, self.inner.linearization).entry
-        return self.observed(system, SMOOTH_MIXTURE, observer=STORE, moves=moves)
+        return self.observed(system, SMOOTH_PARTICLES, observer=STORE, moves=moves)
 
     def smoothing_method(self, system: System) -> str:
         """Name the method of the smoothed states."""

@@ -18,7 +18,7 @@ from pymc_statespace_filters.compiler.lowering.compiled_system import compile_sy
 from pymc_statespace_filters.compiler.lowering.symbols import symbols_of
 from pymc_statespace_filters.errors import FilterWarning, ModelError
 from pymc_statespace_filters.filters.ensemble.part_moments import _row_of_cov, draw_of_mixture
-from pymc_statespace_filters.filters.regimes import backward_simulation
+from pymc_statespace_filters.filters.ensemble.summaries import n_distinct
 from pymc_statespace_filters.filters.regimes.draws import draws_of
 from pymc_statespace_filters.filters.regimes.hybrid import hybrid_of
 from pymc_statespace_filters.ops.base import evaluator
@@ -631,7 +631,7 @@ def test_smoothed_states_are_those_of_all_paths(filter, tolerance, draws):
 
 
 def test_parts_of_the_mixture_that_paths_share_count_once():
-    assert backward_simulation._n_distinct.py_func(np.array([3, 1, 3, 0, 3]), 5) == 3
+    assert n_distinct.py_func(np.array([3, 1, 3, 0, 3]), 5) == 3
 
 
 def check_smoothed(found, mean, cov, probability, tolerance):

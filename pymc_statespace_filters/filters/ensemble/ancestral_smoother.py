@@ -20,16 +20,23 @@ from typing import NamedTuple
 import numpy as np
 from numba import carray
 
-from ...compiler.native.entry_point import EntryPoint
+from ...compiler.native.entry_point import EntryPoint, pointer
 from ...compiler.native.jit import copy_into, inline_always, njit_internal, njit_reassoc
-from ...compiler.native.plan import RECORD, REQUEST, plan_entry
+from ...compiler.native.plan import (
+    HEALTH_SIZE,
+    N_RESULTS,
+    RECORD,
+    REQUEST,
+    RESULTS,
+    plan_entry,
+)
 from ...compiler.numerics.small_cholesky import cholesky, solve_lower, solve_lower_transposed
-from ..calls import ALL_STEPS, OK, opened, single_record, wanted_rows
+from ..calls import OK, opened, reals_at, single_record, wanted_rows
 from ..outcomes import NONE, is_missing
 from ..plan import PLAN, free_states
 from .callbacks import CALLBACK_ARGUMENTS, ENDED, FORECAST, RESAMPLED, UPDATED, run_observed
 from .kalman_update import mark_finite
-from .summaries import finite_weights, summarise_row, write_summaries
+from .summaries import finite_weights, forget, places_of, summarise_row
 
 LAG = 10
 """Observations after which the past of a resampled particle is settled."""
@@ -39,9 +46,11 @@ NO_LAG = np.iinfo(np.int64).max // 2
 
 # Integers of the callback: the header below; then the free states, the steps of the rows, the
 # observation at which each is settled, and a slot of first ancestors (N,) for every row kept.
-# Reals: results as `summarise_row` writes them, the last weights (N,), and slots of states (n, N).
-_N_HEADER = 10
-_N, _MEMBERS, _P, _ROWS, _SLOTS, _SEED, _UPDATES, _FREE, _STORED, _SETTLED = range(_N_HEADER)
+# Reals: the last weights (N,), and slots of states (n, N).
+_N_HEADER = 11
+(
+    _N, _MEMBERS, _P, _ROWS, _SLOTS, _SEED, _UPDATES, _FREE, _STORED, _SETTLED, _RESULTS
+) = range(_N_HEADER)  # fmt: skip
 
 
 class _Past(NamedTuple):
@@ -52,7 +61,6 @@ class _Past(NamedTuple):
     rows: np.ndarray
     settled_at: np.ndarray
     origins: np.ndarray
-    results: np.ndarray
     last_log_w: np.ndarray
     states: np.ndarray
 
@@ -65,8 +73,7 @@ def _n_integers(header):
 
 @inline_always
 def _n_reals(header):
-    n, N = header[_N], header[_MEMBERS]
-    return (3 * n + 1) * header[_ROWS] + N + header[_SLOTS] * n * N
+    return header[_MEMBERS] * (1 + header[_SLOTS] * header[_N])
 
 
 @njit_internal
@@ -74,13 +81,12 @@ def _past_of(integers, reals):
     """Name the parts of the two vectors."""
     header, whole = integers[:_N_HEADER], integers[_N_HEADER:]
     n, N, R = header[_N], header[_MEMBERS], header[_ROWS]
-    S, n_free, n_results = header[_SLOTS], header[_FREE], (3 * n + 1) * R
+    S, n_free = header[_SLOTS], header[_FREE]
     return _Past(
         header=header, free=whole[:n_free], rows=whole[n_free : n_free + R],
         settled_at=whole[n_free + R : n_free + 2 * R],
-        origins=whole[n_free + 2 * R :].reshape(S, N), results=reals[:n_results],
-        last_log_w=reals[n_results : n_results + N],
-        states=reals[n_results + N :].reshape(S, n, N),
+        origins=whole[n_free + 2 * R :].reshape(S, N), last_log_w=reals[:N],
+        states=reals[N:].reshape(S, n, N),
     )  # fmt: skip
 
 
@@ -118,13 +124,14 @@ def _carry_past(integers, reals, event, j, k, X, log_w, d, D, ancestors):
 def _settle(past, log_w):
     """Write the summary of the oldest row that is kept."""
     header = past.header
-    row, R = header[_SETTLED], header[_ROWS]
+    row = header[_SETTLED]
     slot = row % header[_SLOTS]
-    states = past.states[slot]
+    states, to = past.states[slot], carray(pointer(header[_RESULTS]), (N_RESULTS,), np.int64)
     w = finite_weights(states, log_w)
     # One number for all rows: neighbours choose the same ancestry while it lives.
-    summarise_row(past.results, R, row, states, w, header[_SEED], 0)
-    past.results[3 * header[_N] * R + row] = _count_distinct(w, past.origins[slot])
+    summarise_row(to, row, states, w, header[_SEED])
+    _, _, _, n_effective = places_of(to, header[_N], row)
+    n_effective[0] = _count_distinct(w, past.origins[slot])
     header[_SETTLED] += 1
 
 
@@ -268,17 +275,19 @@ def _smooth(plan, record, request, results):
     header[_N], header[_MEMBERS], header[_P] = words[PLAN.n], words[PLAN.n_members], words[PLAN.p]
     header[_ROWS], header[_SLOTS], header[_FREE] = rows.size, S, words[PLAN.n_free]
     header[_SEED], header[_UPDATES] = call.request[REQUEST.draw_seed], words[PLAN.updates]
-    header[_STORED], header[_SETTLED] = 0, 0
+    header[_STORED], header[_SETTLED], header[_RESULTS] = 0, 0, call.results.ctypes.data
     integers, reals = np.empty(_n_integers(header), np.int64), np.empty(_n_reals(header))
     copy_into(integers[:_N_HEADER], header)
     past = _past_of(integers, reals)
     copy_into(past.free, free_states(words))
     copy_into(past.rows, rows)
     copy_into(past.settled_at, settled_at)
-    past.results[:], past.last_log_w[:] = np.nan, -math.log(words[PLAN.n_members])
+    past.last_log_w[:] = -math.log(words[PLAN.n_members])
+    forget(call, words[PLAN.n], 0)
     status, _, health = run_observed(call, plan, record, integers, reals)
-    # Where the filter fails, nothing is known: a state is given all observations.
-    write_summaries(call, reals, health, 0 if health[1] != NONE else ALL_STEPS)
+    if health[1] != NONE:  # nothing is known: a state is given all observations
+        forget(call, words[PLAN.n], 0)
+    copy_into(reals_at(call.results[RESULTS.health], (HEALTH_SIZE,)), health)
     return status
 
 

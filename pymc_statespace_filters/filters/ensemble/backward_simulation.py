@@ -14,22 +14,24 @@ these fail, all weights are computed.
 """
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numba import carray
 
 from ...compiler.native.entry_point import EntryPoint
 from ...compiler.native.jit import copy_into, inline_always, njit_internal
-from ...compiler.native.plan import RECORD, REQUEST, plan_entry
+from ...compiler.native.plan import HEALTH_SIZE, RECORD, REQUEST, RESULTS, plan_entry
 from ...compiler.numerics.philox import STATES, key_words, open_unit, philox
 from ...compiler.numerics.restricted_domain import exp
 from ...compiler.numerics.small_cholesky import cholesky, solve_lower
-from ..calls import ALL_STEPS, OK, opened, single_record, wanted_rows
+from ..calls import OK, opened, reals_at, single_record, wanted_rows
 from ..outcomes import NO_PROCESS_NOISE, NONE
 from ..plan import PLAN, propagate, read_system
 from .callbacks import CALLBACK_ARGUMENTS, FORECAST, UPDATED, run_observed
+from .evaluation import layout_of
 from .part_moments import choose
-from .summaries import finite_weights, write_summaries
+from .summaries import finite_weights, forget, n_distinct, places_of
 from .weights import normalise
 
 PARTICLES_PER_PATH = 16
@@ -50,42 +52,74 @@ def _store(integers, reals, event, j, k, X, log_w, d, D, ancestors):
 STORE = EntryPoint(_store, CALLBACK_ARGUMENTS, "store_particles")
 
 
-@njit_internal
-def n_paths_of(n_particles):
-    """How many paths are drawn through so many particles."""
-    return max(_LEAST_PATHS, n_particles // PARTICLES_PER_PATH)
+def path_smoother(name: str, simulate: Callable) -> EntryPoint:
+    """An entry point that runs a filter, stores its particles, and draws paths back through them.
+
+    ``simulate(call, record, stored, n_paths, rows)`` writes results of the rows, from the particles
+    and log weights of all steps (K, rows of a particle + 1, N). It returns a code of
+    `filters.outcomes`.
+    """
+
+    def smooth(plan, record, request, results):
+        status, call = opened(plan, record, request, results)
+        if status != OK:
+            return status
+        layout, _ = layout_of(call.plan)
+        n, N = layout.order.size, call.plan[PLAN.n_members]
+        call.results[RESULTS.n_states] = n
+        if call.request[REQUEST.sizes_only]:
+            return status
+        data = single_record(call, 0, 0, call.record[RECORD.n_rows])
+        n_steps = data.steps[-1] if data.steps.size else np.int64(0)
+        stored = np.empty((n_steps + 1, layout.rows + 1, N))
+        integers, reals = np.array([layout.rows, N]), stored.reshape(stored.size)
+        status, _, health = run_observed(call, plan, record, integers, reals)
+        forget(call, n, 0)
+        if health[1] == NONE:
+            n_paths = max(_LEAST_PATHS, N // PARTICLES_PER_PATH)
+            code = simulate(call, data, stored, n_paths, wanted_rows(call))
+            if code != NONE:
+                forget(call, n, 0)
+                health[1], health[2] = code, 0.0
+        copy_into(reals_at(call.results[RESULTS.health], (HEALTH_SIZE,)), health)
+        return status
+
+    return plan_entry(smooth, name, (simulate,))
 
 
 @njit_internal
-def _simulate_backward(system, t0, seed, N, n_steps, stored, rows, out):
-    """Write what rows are summarised to; False if a covariance of a step is singular."""
-    n, width, R = system.n, -(-N // 64) * 64, rows.size
-    size, M = (n + 1) * N, n_paths_of(N)
+def _simulate(call, record, stored, M, rows):
+    """Draw paths of states; a failure if a covariance of a step is singular."""
+    system, seed = (
+        read_system(call.plan, record.theta, record.inputs),
+        call.request[REQUEST.draw_seed],
+    )
+    (n_steps, n, N), row = stored.shape, rows.size - 1
+    n_steps, n = n_steps - 1, n - 1
+    width = -(-N // 64) * 64
     paths, chosen = np.empty((M, n)), np.empty(M, np.int64)
     kernel = (np.empty((n, N)), np.empty((N, n, n)), np.empty(N))
     noise, scratch = np.zeros((system.m, width)), np.empty((n, N))
     intervals = (np.empty(N), np.empty(N, np.int64))
-    row = R - 1
     for k in range(n_steps, -1, -1):
-        here = stored[k * size : (k + 1) * size]
-        X = here[: n * N].reshape(n, N)
-        w = finite_weights(X, here[n * N :])
+        X = stored[k, :n]
+        w = finite_weights(X, stored[k, n])
         _fill_intervals(w, intervals)
         if k == n_steps:
             for path in range(M):
                 u, _ = _uniforms(seed, 0, path, k)
                 chosen[path] = _find(intervals, u)
         else:
-            if not _kernels(system, k, t0 + k * system.dt, X, w, noise, scratch, kernel):
-                return False
+            if not _kernels(system, k, record.t0 + k * system.dt, X, w, noise, scratch, kernel):
+                return NO_PROCESS_NOISE
             _choose_particles(seed, k, w, intervals, kernel, paths, chosen)
         for path in range(M):
             for a in range(n):
                 paths[path, a] = X[a, chosen[path]]
         if row >= 0 and rows[row] == k:
-            _summarise_paths(out, R, row, paths, chosen, N)
+            _write_row(call.results, row, paths, n_distinct(chosen, N))
             row -= 1
-    return True
+    return NONE
 
 
 @njit_internal
@@ -195,46 +229,19 @@ def _find(intervals, u):
 
 
 @njit_internal
-def _summarise_paths(out, n_rows, row, paths, chosen, N):
-    """Mean, deviation and the first of the paths; the number of distinct particles in them."""
+def _write_row(to, row, paths, n_particles):
+    """Write mean, deviation and the first of the paths, and how many particles all come from."""
     M, n = paths.shape
-    moments = out[: 3 * n * n_rows].reshape(3, n_rows, n)
+    means, sds, drawn, n_effective = places_of(to, n, row)
     for a in range(n):
         mean, square = 0.0, 0.0
         for path in range(M):
             mean += paths[path, a] / M
         for path in range(M):
             square += (paths[path, a] - mean) ** 2
-        moments[0, row, a], moments[1, row, a] = mean, math.sqrt(square / (M - 1))
-        moments[2, row, a] = paths[0, a]
-    seen, count = np.zeros(N, np.bool_), 0
-    for i in chosen:
-        if not seen[i]:
-            seen[i] = True
-            count += 1
-    out[3 * n * n_rows + row] = count
+        means[a], sds[a], drawn[a] = mean, math.sqrt(square / (M - 1)), paths[0, a]
+    n_effective[0] = n_particles
 
 
-def _smooth(plan, record, request, results):
-    status, call = opened(plan, record, request, results)
-    if status != OK or call.request[REQUEST.sizes_only]:
-        return status
-    n, N, rows = call.plan[PLAN.n], call.plan[PLAN.n_members], wanted_rows(call)
-    data = single_record(call, 0, 0, call.record[RECORD.n_rows])
-    n_steps = data.steps[-1] if data.steps.size else np.int64(0)
-    integers, stored = np.array([n, N]), np.empty((n_steps + 1) * (n + 1) * N)
-    reals = np.full((3 * n + 1) * rows.size, np.nan)
-    status, _, health = run_observed(call, plan, record, integers, stored)
-    if health[1] == NONE:
-        system, seed = (
-            read_system(call.plan, data.theta, data.inputs),
-            call.request[REQUEST.draw_seed],
-        )
-        if not _simulate_backward(system, data.t0, seed, N, n_steps, stored, rows, reals):
-            health[1], health[2] = NO_PROCESS_NOISE, 0.0
-    write_summaries(call, reals, health, 0 if health[1] != NONE else ALL_STEPS)
-    return status
-
-
-SMOOTH = plan_entry(_smooth, "backward_simulation")
+SMOOTH = path_smoother("backward_simulation", _simulate)
 """Smoothed states by backward simulation."""

@@ -5,9 +5,9 @@ import math
 import numpy as np
 from numba import carray
 
-from ...compiler.native.entry_point import EntryPoint
+from ...compiler.native.entry_point import EntryPoint, pointer
 from ...compiler.native.jit import copy_into, inline_always, njit_internal
-from ...compiler.native.plan import HEALTH_SIZE, REQUEST, RESULTS, plan_entry
+from ...compiler.native.plan import HEALTH_SIZE, N_RESULTS, REQUEST, RESULTS, plan_entry
 from ...compiler.numerics.philox import STATES, uniform_at
 from ..calls import OK, first_unknown, opened, reals_at, wanted_rows
 from ..plan import PLAN
@@ -19,17 +19,16 @@ from .weights import effective_number, normalise
 LAST_EVENTS = {"predicted": int(PREDICTED), "filtered": int(UPDATED)}
 """The last event at a step that a moment includes."""
 
-# Integers of the callback; then the steps of the rows, and the order of the states.
-_N_HEADER = 15
-(
-    _PART_ROWS, _MEMBERS, _ROWS, _LAST_EVENT, _SEED, _NEXT, _EXACT, _N, _MEAN, _SD, _COV,
-    _DRAWN, _EFFECTIVE, _STATES, _WEIGHTS,
-) = range(_N_HEADER)  # fmt: skip
-_ADDRESSES = (
-    (_MEAN, RESULTS.mean), (_SD, RESULTS.sd), (_COV, RESULTS.cov), (_DRAWN, RESULTS.drawn),
-    (_EFFECTIVE, RESULTS.n_effective_wanted), (_STATES, RESULTS.members),
-    (_WEIGHTS, RESULTS.weights),
+_OF_ROWS = (
+    RESULTS.mean, RESULTS.sd, RESULTS.cov, RESULTS.drawn, RESULTS.n_effective_wanted,
+    RESULTS.members, RESULTS.weights,
 )  # fmt: skip
+
+# Integers of the callback; then the steps of the rows, and the order of the states.
+_N_HEADER = 9
+(
+    _PART_ROWS, _MEMBERS, _ROWS, _LAST_EVENT, _SEED, _NEXT, _EXACT, _N, _RESULTS
+) = range(_N_HEADER)  # fmt: skip
 
 
 @inline_always
@@ -52,8 +51,7 @@ def _header(call, layout):
     integers[_ROWS], integers[_LAST_EVENT] = rows.size, plan[PLAN.last_event]
     integers[_SEED], integers[_NEXT] = call.request[REQUEST.draw_seed], 0
     integers[_EXACT], integers[_N] = layout.n_exact, order.size
-    for place, slot in _ADDRESSES:
-        integers[place] = call.results[slot]
+    integers[_RESULTS] = call.results.ctypes.data
     copy_into(integers[_N_HEADER : _N_HEADER + rows.size], rows)
     copy_into(integers[_N_HEADER + rows.size :], order)
     return integers
@@ -67,33 +65,38 @@ def _summarise(integers, reals, event, j, k, X, log_w, d, D, ancestors):
         w = finite_weights(parts, carray(log_w, (header[_MEMBERS],)))
         first = _N_HEADER + header[_ROWS]
         order = carray(integers, (first + header[_N],))[first:]
-        _write_row(header, row, k, order, parts, w)
+        to, n_effective = carray(pointer(header[_RESULTS]), (N_RESULTS,), np.int64), np.inf
+        if w.any():
+            n_effective = effective_number(w)
+        write_row(to, row, k, header[_EXACT], order, parts, w, n_effective, header[_SEED])
 
 
 @njit_internal
-def _write_row(header, row, k, order, parts, w):
-    """Write what is wanted of a row; addresses of other things are 0."""
-    n, N, R, n_exact = order.size, w.size, header[_ROWS], header[_EXACT]
-    if header[_STATES] != 0:
-        states = reals_at(header[_STATES], (R, N, n))[row]
-        copy_into(reals_at(header[_WEIGHTS], (R, N))[row], w)
+def write_row(to, row, k, n_exact, order, parts, w, n_effective, seed):
+    """Write what is wanted of a row, from weighted parts; those without weight have no moments.
+
+    Fewer effective parts leave the variance between them too small, by a factor that is known.
+    """
+    n, N, R = order.size, w.size, to[RESULTS.n_wanted]
+    if to[RESULTS.members] != 0:
+        states = reals_at(to[RESULTS.members], (R, N, n))[row]
+        copy_into(reals_at(to[RESULTS.weights], (R, N))[row], w)
         for i in range(N):
             for a in range(n):
                 states[i, a] = parts[order[a], i]
     if not w.any():
         return
-    n_effective, cov = effective_number(w), np.empty((n, n))
-    mean = reals_at(header[_MEAN], (R, n))[row]
+    mean, cov = reals_at(to[RESULTS.mean], (R, n))[row], np.empty((n, n))
     mixture_moments(w, parts, n_exact, order, 1.0 - 1.0 / n_effective, mean, cov)
-    if header[_COV] != 0:
-        copy_into(reals_at(header[_COV], (R, n * n))[row], cov.reshape(n * n))
-    if header[_DRAWN] != 0:
-        sd = reals_at(header[_SD], (R, n))[row]
+    if to[RESULTS.cov] != 0:
+        copy_into(reals_at(to[RESULTS.cov], (R, n * n))[row], cov.reshape(n * n))
+    if to[RESULTS.drawn] != 0:
+        sd = reals_at(to[RESULTS.sd], (R, n))[row]
         for a in range(n):
             sd[a] = math.sqrt(max(cov[a, a], 0.0))
-        drawn = reals_at(header[_DRAWN], (R, n))[row]
-        draw_of_mixture(w, parts, n_exact, order, header[_SEED], k, drawn)
-        reals_at(header[_EFFECTIVE], (R,))[row] = n_effective
+        drawn = reals_at(to[RESULTS.drawn], (R, n))[row]
+        draw_of_mixture(w, parts, n_exact, order, seed, k, drawn)
+        reals_at(to[RESULTS.n_effective_wanted], (R,))[row] = n_effective
 
 
 @njit_internal
@@ -109,20 +112,34 @@ def finite_weights(X, log_w):
 
 
 @njit_internal
-def summarise_row(numbers, n_rows, row, X, w, draw_seed, place):
-    """Write mean, deviation, a draw and the effective number of weighted members to their row.
+def places_of(to, n, row):
+    """Where mean, deviation, a draw (n,) and the effective number (1,) of a row go."""
+    R = to[RESULTS.n_wanted]
+    mean, sd = reals_at(to[RESULTS.mean], (R, n))[row], reals_at(to[RESULTS.sd], (R, n))[row]
+    n_effective = reals_at(to[RESULTS.n_effective_wanted], (R,))[row : row + 1]
+    return mean, sd, reals_at(to[RESULTS.drawn], (R, n))[row], n_effective
 
-    The draw is the one that falls to the uniform number of ``place``.
-    """
-    n = X.shape[0]
-    out = numbers[: 3 * n * n_rows].reshape(3, n_rows, n)
+
+@njit_internal
+def n_distinct(indices, n):
+    """How many of the indices below n occur; numba's sort takes a second of compilation."""
+    is_met, found = np.zeros(n, np.bool_), 0
+    for i in indices:
+        found += not is_met[i]
+        is_met[i] = True
+    return found
+
+
+@njit_internal
+def summarise_row(to, row, X, w, draw_seed):
+    """Write mean, deviation and a draw of weighted members; one place of the seed for all rows."""
     if not w.any():
         return
-    _moments(w, X, out[0, row], out[1, row])
-    chosen = choose(w, uniform_at(draw_seed, STATES, place, 0))
-    for a in range(n):
-        out[2, row, a] = X[a, chosen]
-    numbers[3 * n * n_rows + row] = effective_number(w)
+    mean, sd, drawn, _ = places_of(to, X.shape[0], row)
+    _moments(w, X, mean, sd)
+    chosen = choose(w, uniform_at(draw_seed, STATES, 0, 0))
+    for a in range(X.shape[0]):
+        drawn[a] = X[a, chosen]
 
 
 @njit_internal
@@ -145,36 +162,12 @@ SUMMARISE = EntryPoint(_summarise, CALLBACK_ARGUMENTS, "summarise")
 
 
 @njit_internal
-def forget_row(numbers, n, n_rows, row):
-    """Leave a row unknown."""
-    for place in range(3):
-        for a in range(n):
-            numbers[(place * n_rows + row) * n + a] = np.nan
-    numbers[3 * n * n_rows + row] = np.nan
-
-
-@njit_internal
-def write_summaries(call, numbers, health, until):
-    """Write what rows were summarised to as results; from the step ``until`` on all are unknown."""
-    rows, n, to = wanted_rows(call), call.results[RESULTS.n_states], call.results
-    for row in range(rows.size):
-        if rows[row] >= until:
-            forget_row(numbers, n, rows.size, row)
-    size = n * rows.size
-    copy_into(reals_at(to[RESULTS.mean], (size,)), numbers[:size])
-    copy_into(reals_at(to[RESULTS.sd], (size,)), numbers[size : 2 * size])
-    copy_into(reals_at(to[RESULTS.drawn], (size,)), numbers[2 * size : 3 * size])
-    copy_into(reals_at(to[RESULTS.n_effective_wanted], (rows.size,)), numbers[3 * size :])
-    copy_into(reals_at(to[RESULTS.health], (HEALTH_SIZE,)), health)
-
-
-@njit_internal
-def _forget(call, n, first):
+def forget(call, n, first):
     """Leave rows from this one on unknown."""
     to, R, N = call.results, wanted_rows(call).size, call.plan[PLAN.n_members]
     widths = (n, n, n * n, n, 1, N * n, N)
-    for i in range(len(_ADDRESSES)):
-        address = to[_ADDRESSES[i][1]]
+    for i in range(len(_OF_ROWS)):
+        address = to[_OF_ROWS[i]]
         if address != 0:
             reals_at(address, (R * widths[i],))[first * widths[i] :] = np.nan
 
@@ -189,9 +182,9 @@ def _states(plan, record, request, results):
     to[RESULTS.n_states] = n
     if call.request[REQUEST.sizes_only]:
         return status
-    _forget(call, n, 0)
+    forget(call, n, 0)
     status, terms, health = run_observed(call, plan, record, _header(call, layout), np.empty(0))
-    _forget(call, n, searchsorted(wanted_rows(call), first_unknown(call, health), 0))
+    forget(call, n, searchsorted(wanted_rows(call), first_unknown(call, health), 0))
     if to[RESULTS.terms] != 0:
         copy_into(reals_at(to[RESULTS.terms], (terms.size,)), terms)
     copy_into(reals_at(to[RESULTS.health], (HEALTH_SIZE,)), health)

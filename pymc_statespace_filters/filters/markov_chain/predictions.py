@@ -4,13 +4,13 @@ import numpy as np
 
 from ...compiler.native.jit import njit_internal
 from ...compiler.native.plan import RECORD, REQUEST, plan_entry
-from ..calls import OK, opened, single_record
+from ..calls import ALL_STEPS, OK, opened, single_record
 from ..outcomes import NONE
 from ..plan import read_system
 from ..point_mass.predictions import observations_at, unknown_laws, write_mixture
 from .forward import forward_pass, rows_on_tape
 from .machine import read_chain
-from .states import predicted_at_observations
+from .states import read_forwards
 
 
 @njit_internal
@@ -30,10 +30,9 @@ def _predictions(plan, record, request, results):
     system = read_system(call.plan, data.theta, data.inputs)
     chain = read_chain(call.plan, data.theta, data.inputs)
     tape = np.empty((rows_on_tape(data.steps), chain.n_states))
-    code, end = forward_pass(chain, data, np.empty(0), np.empty(J), tape)
-    known = J if code == NONE else int(end)
-    weights = predicted_at_observations(chain, data, tape, known)
-    for j in range(known):
+    code, j = forward_pass(chain, data, np.empty(0), np.empty(J), tape)
+    end, weights = ALL_STEPS if code == NONE else data.steps[int(j)], np.empty((J, chain.n_states))
+    for j in range(read_forwards(chain, data, tape, data.steps, 0, end, False, weights)):
         _write_law(system, chain, data, j, weights[j], laws)
     return status
 

@@ -8,8 +8,6 @@ The smoothed probabilities are the filtered ones times what the later observatio
 and a path is drawn from the last step back, from f_i P(i -> the state drawn after it).
 """
 
-import math
-
 import numpy as np
 
 from ...compiler.native.jit import copy_into, njit_internal
@@ -25,6 +23,8 @@ from ..calls import (
     state_wanted,
     wanted_rows,
 )
+from ..ensemble.part_moments import choose
+from ..ensemble.summaries import forget, write_row
 from ..outcomes import NONE, OUT_OF_MEMORY, is_missing
 from ..plan import PLAN
 from .forward import forward_pass, rows_on_tape
@@ -41,36 +41,8 @@ MOMENTS = {
 
 
 @njit_internal
-def _drawn(weights, u):
-    """The number of a state, with probabilities in proportion to weights."""
-    total = 0.0
-    for i in range(weights.size):
-        total += weights[i]
-    threshold, last = u * total, 0
-    for i in range(weights.size):
-        if weights[i] > 0.0:
-            last = i
-            threshold -= weights[i]
-            if threshold < 0.0:
-                break
-    return last
-
-
-@njit_internal
-def predicted_at_observations(chain, record, tape, known):
-    """The probabilities (known, K) of the states just before the first observations."""
-    found, place, k = np.empty((known, chain.n_states)), np.int64(0), np.int64(0)
-    for j in range(known):
-        place += record.steps[j] - k
-        k = record.steps[j]
-        copy_into(found[j], tape[place])
-        place += 0 if is_missing(record.observed, j) else 2
-    return found
-
-
-@njit_internal
-def _read_forwards(chain, record, tape, rows, first, end, moment, seed, probabilities, paths):
-    """Write the predicted or filtered probabilities at the rows, and independent draws.
+def read_forwards(chain, record, tape, rows, first, end, is_filtered, probabilities):
+    """Write the predicted or filtered probabilities at the rows; return how many rows are known.
 
     The tape begins at step ``first``, and is known in front of step ``end``.
     """
@@ -79,14 +51,12 @@ def _read_forwards(chain, record, tape, rows, first, end, moment, seed, probabil
     for k in range(first, last):
         is_seen = j < steps.size and steps[j] == k
         is_informed = is_seen and not is_missing(record.observed, j)
-        at = place + 2 if is_informed and moment == FILTERED else place
         if r < rows.size and rows[r] == k:
-            for i in range(chain.n_states):
-                probabilities[r, i] = tape[at, i]
-            paths[r] = _drawn(probabilities[r], uniform_at(seed, STATES, k, 0))
+            copy_into(probabilities[r], tape[place + 2 * (is_informed and is_filtered)])
             r += 1
         place += 2 * is_informed + 1
         j += is_seen
+    return r
 
 
 @njit_internal
@@ -114,7 +84,7 @@ def _read_backwards(chain, record, tape, n_taped, rows, seed, probabilities, pat
                 if successor == drawn:
                     weights[origin] += f[origin] * P[m]
             b, new = new, b
-        drawn = _drawn(weights, uniform_at(seed, STATES, k, 0))
+        drawn = choose(weights, uniform_at(seed, STATES, k, 0) * weights.sum())
         if r >= 0 and rows[r] == k:
             for i in range(K):
                 probabilities[r, i] = f[i] * b[i]
@@ -130,31 +100,25 @@ def _read_backwards(chain, record, tape, n_taped, rows, seed, probabilities, pat
 
 
 @njit_internal
-def _read_path(chain, record, tape, rows, probabilities, paths):
+def _read_path(chain, record, tape, rows, probabilities):
     """Write the most probable path, whose states have probability one."""
     path = most_probable_path(chain, record, tape)
     for r in range(rows.size):
-        if rows[r] >= path.size:
-            break
-        paths[r] = path[rows[r]]
-        probabilities[r, :] = 0.0
-        probabilities[r, paths[r]] = 1.0
+        probabilities[r, path[rows[r]]] = 1.0
 
 
 @njit_internal
-def _probabilities(call, rows, moment, paths):
-    """The chain, and probabilities (R, K) of its states at the rows: NaN where unknown.
+def _probabilities(call, chain, record, rows, moment, paths):
+    """Probabilities (R, K) of the states at the rows, and how many of them are known.
 
     The filter may go on from earlier rows. What it leaves is written where it is wanted.
     """
     to, J = call.results, call.record[RECORD.n_rows]
-    record = single_record(call, 0, 0, J)
     terms = reals_at(to[RESULTS.terms], (J,)) if to[RESULTS.terms] != 0 else np.empty(J)
     health = reals_at(to[RESULTS.health], (HEALTH_SIZE,))
     terms[:] = -np.inf
     health[0], health[1], health[2] = np.inf, OUT_OF_MEMORY, 0.0
-    chain = read_chain(call.plan, record.theta, record.inputs)
-    probabilities = np.full((rows.size, chain.n_states), np.nan)
+    found = np.zeros((rows.size, chain.n_states))
     tape = np.empty((rows_on_tape(record.steps), chain.n_states))
     before, after = state_given(call.request), state_wanted(call)
     code, end = forward_pass(chain, record, before, terms, tape)
@@ -167,33 +131,18 @@ def _probabilities(call, rows, moment, paths):
         if code == NONE and record.steps.size:
             after[0] = record.steps[-1]
             copy_into(after[1:], tape[end - 1])
-    seed = call.request[REQUEST.draw_seed]
-    if moment == SMOOTHED:
-        if code == NONE:
-            _read_backwards(chain, record, tape, end, rows, seed, probabilities, paths)
-    elif moment == MOST_PROBABLE:
-        if code == NONE:
-            _read_path(chain, record, tape, rows, probabilities, paths)
-    else:
+    if moment == PREDICTED or moment == FILTERED:
         first, known = np.int64(before[0]) if before.size else 0, first_unknown(call, health)
-        _read_forwards(chain, record, tape, rows, first, known, moment, seed, probabilities, paths)
-    return chain, probabilities
-
-
-@njit_internal
-def _moments(chain, weights, mean, cov):
-    """Write the mean (n,) and the covariance (n, n) of the state; NaN where it is unknown."""
-    n = mean.size
-    for a in range(n):
-        mean[a] = 0.0
-        for i in range(weights.size):
-            mean[a] += weights[i] * chain.X[a, i]
-    for a in range(n):
-        for b in range(a + 1):
-            total = 0.0
-            for i in range(weights.size):
-                total += weights[i] * (chain.X[a, i] - mean[a]) * (chain.X[b, i] - mean[b])
-            cov[a, b] = cov[b, a] = total
+        is_filtered = moment == FILTERED
+        return found, read_forwards(chain, record, tape, rows, first, known, is_filtered, found)
+    if code != NONE:
+        return found, 0
+    if moment == SMOOTHED:
+        seed = call.request[REQUEST.draw_seed]
+        _read_backwards(chain, record, tape, end, rows, seed, found, paths)
+    else:
+        _read_path(chain, record, tape, rows, found)
+    return found, rows.size
 
 
 def _states(plan, record, request, results):
@@ -207,34 +156,16 @@ def _states(plan, record, request, results):
     if call.request[REQUEST.sizes_only]:
         return status
     rows, to, n = wanted_rows(call), call.results, call.plan[PLAN.n]
-    paths = np.zeros(rows.size, np.int64)
-    chain, found = _probabilities(call, rows, call.plan[PLAN.last_event], paths)
-    K = chain.n_states
-    n_drawn = rows.size if to[RESULTS.drawn] != 0 else 0
-    n_run = rows.size if to[RESULTS.members] != 0 else 0
-    mean, sd = reals_at(to[RESULTS.mean], (rows.size, n)), reals_at(to[RESULTS.sd], (n_drawn, n))
-    drawn = reals_at(to[RESULTS.drawn], (n_drawn, n))
-    n_effective = reals_at(to[RESULTS.n_effective_wanted], (n_drawn,))
-    covs = reals_at(to[RESULTS.cov], (n_run, n, n))
-    members = reals_at(to[RESULTS.members], (n_run, K, n))
-    weights = reals_at(to[RESULTS.weights], (n_run, K))
-    cov = np.empty((n, n))
-    for r in range(rows.size):
-        _moments(chain, found[r], mean[r], cov)
-        if n_drawn:
-            is_known = not np.isnan(found[r, 0])
-            n_effective[r] = np.inf if is_known else np.nan
-            for a in range(n):
-                sd[r, a] = math.sqrt(cov[a, a])
-                drawn[r, a] = chain.X[a, paths[r]] if is_known else np.nan
-        if n_run:
-            for a in range(n):
-                for b in range(n):
-                    covs[r, a, b] = cov[a, b]
-            for i in range(K):
-                weights[r, i] = found[r, i]
-                for a in range(n):
-                    members[r, i, a] = chain.X[a, i]
+    order, moment, paths = np.arange(n), call.plan[PLAN.last_event], np.zeros(rows.size, np.int64)
+    data = single_record(call, 0, 0, call.record[RECORD.n_rows])
+    forget(call, n, 0)
+    chain = read_chain(call.plan, data.theta, data.inputs)
+    found, known = _probabilities(call, chain, data, rows, moment, paths)
+    seed, drawn = call.request[REQUEST.draw_seed], to[RESULTS.drawn]
+    for r in range(known):
+        write_row(to, r, rows[r], n, order, chain.X, found[r], np.inf, seed)
+        if drawn != 0 and moment == SMOOTHED:
+            copy_into(reals_at(drawn, (rows.size, n))[r], chain.X[:, paths[r]])
     return status
 
 

@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...compiler.native.jit import copy_into, njit_internal
+from ...compiler.native.plan import REQUEST
 from ...compiler.numerics.philox import STATES, uniform_at
 from ...compiler.numerics.small_cholesky import (
     cholesky,
@@ -29,10 +30,13 @@ from ...compiler.numerics.small_cholesky import (
     solve_lower,
     solve_lower_transposed,
 )
+from ..ensemble.backward_simulation import path_smoother
+from ..ensemble.evaluation import layout_of
 from ..ensemble.part_moments import choose, normal_at
-from ..ensemble.summaries import finite_weights
+from ..ensemble.summaries import finite_weights, n_distinct, places_of
 from ..ensemble.weights import normalise
-from ..plan import NULL, call_members
+from ..outcomes import NONE
+from ..plan import NULL, PLAN, call_members, read_system
 
 # Where a step leaves no spread, a state is taken to be within these of its mean: relative to the
 # deviation, and to the value itself.
@@ -230,34 +234,23 @@ def _draw_before(moves, a, X, n_finite, seed, k, first, path):
 
 
 @njit_internal
-def _n_distinct(indices, n):
-    """How many of the indices below n occur; numba's sort takes a second of compilation."""
-    is_met, found = np.zeros(n, np.bool_), 0
-    for i in indices:
-        found += not is_met[i]
-        is_met[i] = True
-    return found
-
-
-@njit_internal
-def _write_row(out, n_rows, row, order, means, variances, drawn, n_parts):
+def _write_row(to, row, order, means, variances, path, n_parts):
     """Write mean, deviation and the first path; and how many parts all of them come from."""
     M, n = means.shape
-    moments = out[: 3 * n * n_rows].reshape(3, n_rows, n)
+    mean, sd, drawn, n_effective = places_of(to, n, row)
     for a in range(n):
         column, total, between = order[a], 0.0, 0.0
-        mean = means[:, column].mean()
-        for path in range(M):
-            total += variances[path, column] / M
-            between += (means[path, column] - mean) ** 2 / (M - 1)
-        moments[0, row, a], moments[1, row, a] = mean, math.sqrt(total + between)
-        moments[2, row, a] = drawn[column]
-    out[3 * n * n_rows + row] = n_parts
+        mean[a] = means[:, column].mean()
+        for m in range(M):
+            total += variances[m, column] / M
+            between += (means[m, column] - mean[a]) ** 2 / (M - 1)
+        sd[a], drawn[a] = math.sqrt(total + between), path[column]
+    n_effective[0] = n_parts
 
 
 @njit_internal
-def simulate_backward(mixtures, n_paths, seed, rows, out):
-    """Write what the wanted rows are summarised to, see `ensemble.summaries.write_summaries`."""
+def simulate_backward(mixtures, n_paths, seed, rows, to):
+    """Write the results of the wanted rows."""
     last, n_finite = mixtures.stored.shape[0] - 1, mixtures.n_finite
     N, n = mixtures.stored.shape[2], mixtures.order.size - n_finite
     paths, parts = np.zeros((n_paths, n_finite + n)), np.empty(n_paths, np.int64)
@@ -280,6 +273,23 @@ def simulate_backward(mixtures, n_paths, seed, rows, out):
             parts[m] = moves.part[chosen]
             _draw_before(moves, chosen, X, n_finite, seed, k, 1 + 2 * n * m, paths[m])
         if is_wanted:
-            n_parts = _n_distinct(parts, N)
-            _write_row(out, rows.size, row, mixtures.order, means, variances, paths[0], n_parts)
+            n_parts = n_distinct(parts, N)
+            _write_row(to, row, mixtures.order, means, variances, paths[0], n_parts)
             row -= 1
+
+
+@njit_internal
+def _through_particles(call, record, stored, n_paths, rows):
+    """The same through the particles of all steps, each with a regime and a Kalman filter."""
+    (_, n_finite, order), settings = layout_of(call.plan)
+    system = read_system(call.plan, record.theta, record.inputs)
+    mixtures = Mixtures(
+        stored=stored, n_finite=n_finite, order=order, moves=call.plan[PLAN.moves],
+        n_draws=int(settings[0]), c=system.c, inputs=system.inputs, t0=record.t0, dt=system.dt,
+    )  # fmt: skip
+    simulate_backward(mixtures, n_paths, call.request[REQUEST.draw_seed], rows, call.results)
+    return NONE
+
+
+SMOOTH_PARTICLES = path_smoother("rbpf_smoother", _through_particles)
+"""Smoothed states of a Rao-Blackwellised particle filter."""

@@ -10,9 +10,8 @@ import numpy as np
 
 from ...compiler.native.jit import copy_into, njit_internal
 from ...compiler.native.plan import REQUEST, RESULTS, Plan, plan_entry
-from ..calls import ALL_STEPS, OK, opened, wanted_rows
-from ..ensemble.part_moments import draw_of_mixture
-from ..ensemble.summaries import write_summaries
+from ..calls import OK, opened, reals_at, wanted_rows
+from ..ensemble.summaries import forget, write_row
 from ..gaussian.functions import (
     GaussianFilterFunctions,
     checked,
@@ -28,8 +27,6 @@ from ..gaussian.states import (
     n_steps_of,
     new_health,
     places_on_tape,
-    read_moments,
-    room,
     taped_pass,
 )
 from ..plan import PLAN, make_plan, settings_of
@@ -114,21 +111,15 @@ def _states(plan, record, request, results):
     if status != OK or opening.request[REQUEST.sizes_only]:
         return status
     rows, to, machine = wanted_rows(opening), opening.results, read_machine(opening.plan)
-    n_wanted, n, given = rows.size, machine.n, _settings(opening.plan)
-    mean, sd = room(to[RESULTS.mean], n_wanted, n), room(to[RESULTS.sd], n_wanted, n)
-    drawn = room(to[RESULTS.drawn], n_wanted, n)
-    n_effective = room(to[RESULTS.n_effective_wanted], n_wanted, 1)
-    health, seed = new_health(to), opening.request[REQUEST.draw_seed]
+    n, given, seed = machine.n, _settings(opening.plan), opening.request[REQUEST.draw_seed]
+    forget(opening, n, 0)
     table = table_of(opening, parameters_of(opening), np.empty((0, 0)), np.empty(0))
-    tape, end = taped_pass(opening, machine, given.checks, table, health)
+    tape, end = taped_pass(opening, machine, given.checks, table, new_health(to))
     is_predicted = opening.plan[PLAN.last_event] == 0
     places = places_on_tape(rows, table.rows[:, 0], end, is_predicted)
     for r in range(places.size):
-        s = tape[places[r]]
-        read_moments(s, mean[r], sd[r])
-        w, X = _parts(s, n, given.n_finite, given.regimes)
-        draw_of_mixture(w, X, given.n_finite, given.order, seed, rows[r], drawn[r])
-        set_all(n_effective[r], np.inf)
+        w, X = _parts(tape[places[r]], n, given.n_finite, given.regimes)
+        write_row(to, r, rows[r], given.n_finite, given.order, X, w, np.inf, seed)
     return OK
 
 
@@ -153,20 +144,18 @@ def _smoothed(plan, record, request, results):
     if status != OK or opening.request[REQUEST.sizes_only]:
         return status
     rows, machine, given = wanted_rows(opening), read_machine(opening.plan), _settings(opening.plan)
-    n, health = machine.n, new_health(opening.results)
+    n, to = machine.n, opening.results
     table = table_of(opening, parameters_of(opening), np.empty((0, 0)), np.empty(0))
-    tape, end = taped_pass(opening, machine, given.checks, table, health)
-    reals = np.full((3 * n + 1) * rows.size, np.nan)
-    is_known = end > n_steps_of(table)
-    if is_known:
+    tape, end = taped_pass(opening, machine, given.checks, table, new_health(to))
+    forget(opening, n, 0)
+    if end > n_steps_of(table):
         mixtures = Mixtures(
             stored=_stored(tape, table, given, n), n_finite=given.n_finite, order=given.order,
             moves=opening.plan[PLAN.moves], n_draws=given.n_draws, c=table.theta[0],
             inputs=table.inputs, t0=table.t0, dt=machine.dt,
         )  # fmt: skip
-        simulate_backward(mixtures, N_PATHS, opening.request[REQUEST.draw_seed], rows, reals)
-        set_all(reals[3 * n * rows.size :], N_PATHS)
-    write_summaries(opening, reals, health[0].copy(), ALL_STEPS if is_known else 0)
+        simulate_backward(mixtures, N_PATHS, opening.request[REQUEST.draw_seed], rows, to)
+        set_all(reals_at(to[RESULTS.n_effective_wanted], (rows.size,)), N_PATHS)
     return OK
 
 
