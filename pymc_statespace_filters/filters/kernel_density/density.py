@@ -2,9 +2,9 @@
 
 The density at a target v is sum_l w_l |H|^-1 K(H^-1 (x_l - v)), where H is the lower Cholesky
 factor of the weighted covariance times N_eff^{-1/(n+4)}. Members and targets are whitened by H
-first. In one and two directions the sums go through a grid (`gridded_sum`), O(N), also at targets
-far outside the cloud (`shifted_sum`). In more directions, for few members and for single targets in
-the tails they are exact (`direct_sum`), O(N) per target.
+first. In one and two directions the sums go through a grid (`gridded_sum`), O(N). In more
+directions, for few members and for targets in the tails they are exact (`direct_sum`), O(N) per
+target; the ranks divide the tails evenly, since all targets there may belong to one rank.
 
 A direction in which the members do not spread at all (a state known exactly, or a copy of another)
 is left out: all members and targets lie in the same subspace, and the density is the one on that
@@ -22,15 +22,22 @@ import numpy as np
 
 from ...compiler.native.jit import inline_always, njit_internal
 from ...compiler.numerics.normals import BLOCK
+from ...compiler.numerics.restricted_domain import log
 from ...compiler.numerics.small_cholesky import LOG_TWO_PI, semidefinite_cholesky
 from ..ensemble.kalman_update import Moments, equal_weights, moments_workspace
-from ..ensemble.reductions import weighted_cov, weighted_mean
+from ..ensemble.reductions import (
+    BLOCKS,
+    MEMBERS,
+    allgather,
+    local_range,
+    weighted_cov,
+    weighted_mean,
+)
 from ..plan import log_density
 from .direct_sum import Points, compact, complete_points, kernel_sum_workspace, log_kernel_sum
-from .gridded_sum import gridded_sum_workspace
-from .shifted_sum import log_gridded_sums, shifted_sum_workspace
+from .gridded_sum import FLOOR, gridded_sum_workspace, gridded_sums
 
-_SQRT_HALF = math.sqrt(0.5)
+_SQRT_HALF, _LOG_FLOOR = math.sqrt(0.5), math.log(FLOOR)
 _KNOWN = 1e-13  # a smaller spread, relative to the mean, is rounding of a value known exactly
 _LINE_FROM, _PLANE_FROM = 64, 256  # members from which a grid is at least twice as fast
 
@@ -78,7 +85,9 @@ def density_workspace(local, n):
     sources = Points(np.empty((1 + n, width)), local.n_members, n_ranks == 1)
     targets = Points(np.empty((1 + n, width)), local.n_members, n_ranks == 1)
     exact, grid = kernel_sum_workspace(width), gridded_sum_workspace(n_ranks, width)
-    return sources, targets, (exact, grid, shifted_sum_workspace(n_ranks, n, width))
+    # Indices of the targets in the tails, their number on each rank, and exact sums at them.
+    tails = np.empty(width, np.int64), np.empty((1, n_ranks)), np.empty((1, width))
+    return sources, targets, (exact, grid, tails)
 
 
 @njit_internal
@@ -136,9 +145,57 @@ def _sum_exactly(layout, sources, targets, n_dims, first, logs, work):
     """Logs of the exact sums at the rank's targets, which begin at column ``first``."""
     complete_points(layout, sources, n_dims)
     y, v = sources.rows[1:], targets.rows[1:]
-    _, n_blocks = compact(sources.rows[0, : sources.size], y, n_dims, work)
+    n_blocks = compact(sources.rows[0, : sources.size], y, n_dims, work)
     for i in range(logs.size):
         logs[i] = log_kernel_sum(y, n_dims, n_blocks, v, first + i, work)
+
+
+@njit_internal
+def _has_tails(layout, targets, counts):
+    """Replace the rank's sums by their logarithms; whether any target of any rank is in a tail."""
+    start, end = local_range(layout, targets.size, MEMBERS)
+    sums, n_missed = targets.rows[0, start:end], 0
+    for i in range(sums.size):
+        sums[i] = log(sums[i])
+        n_missed += not sums[i] > _LOG_FLOOR
+    counts[0, layout.rank] = n_missed
+    allgather(layout, counts, BLOCKS)
+    return counts.any()
+
+
+@njit_internal
+def _sum_tails(layout, sources, targets, n_dims, sum_work, tails):
+    """Exact sums at the targets below the floor; afterwards every rank holds all sums."""
+    missed, _, exact = tails
+    complete_points(layout, sources, n_dims)
+    complete_points(layout, targets, n_dims)
+    logs, y, v, n_missed = targets.rows[0], sources.rows[1:], targets.rows[1:], 0
+    for i in range(targets.size):
+        if not logs[i] > _LOG_FLOOR:
+            missed[n_missed] = i
+            n_missed += 1
+    n_blocks = compact(sources.rows[0, : sources.size], y, n_dims, sum_work)
+    start, end = local_range(layout, n_missed, BLOCKS)
+    for k in range(start, end):
+        exact[0, k] = log_kernel_sum(y, n_dims, n_blocks, v, missed[k], sum_work)
+    allgather(layout, exact[:, :n_missed], BLOCKS)
+    for k in range(n_missed):
+        logs[missed[k]] = exact[0, k]
+
+
+@njit_internal
+def log_gridded_sums(layout, sources, targets, n_dims, works):
+    """log sum_l w_l exp(-|y_l - v_i|^2) at the rank's targets, in one or two directions.
+
+    ``sources`` and ``targets`` are `Points`; the logs are written to the targets. Returns False if
+    the grid would be too large.
+    """
+    sum_work, grid_work, tails = works
+    if not gridded_sums(layout, sources, targets, n_dims, grid_work):
+        return False
+    if _has_tails(layout, targets, tails[1]):
+        _sum_tails(layout, sources, targets, n_dims, sum_work, tails)
+    return True
 
 
 @njit_internal

@@ -43,7 +43,7 @@ def kernel_sum_workspace(width):
 
 @njit_internal
 def compact(w, sources, n_dims, work):
-    """Move the members of positive weight to the front; return their number and their blocks."""
+    """Move the members of positive weight to the front; return the number of their blocks."""
     log_w, _, _ = work
     n_sources = 0
     for i in range(w.size):
@@ -57,7 +57,7 @@ def compact(w, sources, n_dims, work):
         for a in range(n_dims):
             sources[a, i] = 0.0
         log_w[i] = -np.inf
-    return n_sources, n_blocks
+    return n_blocks
 
 
 @njit_internal
