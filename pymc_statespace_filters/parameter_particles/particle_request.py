@@ -127,3 +127,14 @@ def check_alive(model: pm.Model, cloud: Cloud) -> None:
             f"the likelihood is positive at {alive.sum()} of {alive.size} draws of the prior, fewer"
             f" than {least}: {why_zero(failures_at(model, dead), len(dead))}, or raise draws"
         )
+
+
+def columns_of(steps: Sequence[Any]) -> dict[str, np.ndarray]:
+    """The fields of named tuples of one type, of which there is at least one, by their names."""
+    return dict(zip(steps[0]._fields, map(np.array, zip(*steps, strict=True)), strict=True))
+
+
+def steps_of[T](kind: type[T], columns: Mapping[str, np.ndarray], prefix: str = "") -> list[T]:
+    """The named tuples of a type from columns whose names have a prefix."""
+    fields: tuple[str, ...] = kind._fields  # type: ignore[attr-defined]  # of a named tuple
+    return [kind(*one) for one in zip(*(columns[prefix + name] for name in fields), strict=True)]

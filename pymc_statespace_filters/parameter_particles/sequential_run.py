@@ -26,7 +26,7 @@ from ..smc.merging import merged_scores
 from ..smc.particles import Populations
 from ..statistics.importance import systematic
 from .observed_rows import ObservedRows, exchanged, exchanging
-from .particle_request import Request, Run, check_alive, least_alive
+from .particle_request import Request, Run, check_alive, columns_of, least_alive
 from .row_calibration import transform_of_row
 
 MAX_VARIANCE = 2.0  # of the log-likelihood at fixed parameters; beyond it members are doubled
@@ -192,26 +192,20 @@ def n_members(rows: ObservedRows) -> int:
 
 def course_dataset(courses: list[RowCourse]) -> xr.Dataset:
     """What happened row by row: scores and their errors, sizes, moves."""
-    names = {"n_stages", "acceptance", "n_members", "variance", "n_updates"}
-    found = {
-        name: ("row", np.array([getattr(one, name) for one in courses]))
-        for name in RowCourse._fields
-        if name in names
-    }
-    paths = np.stack([one.log_evidence for one in courses], axis=1)
-    scores, deviations = merged_scores(paths)
-    sizes, alive = (
-        np.stack([getattr(one, name) for one in courses], axis=1)
-        for name in ("effective_size", "n_alive")
+    columns = columns_of(courses)
+    paths, sizes, alive = (
+        columns.pop(name).T.copy() for name in ("log_evidence", "effective_size", "n_alive")
     )
+    pit = columns.pop("pit")
+    scores, deviations = merged_scores(paths)
     of_populations = ("population", "row")
     return xr.Dataset(
         {
-            **found,
+            **{name: ("row", values) for name, values in columns.items()},
             "score": ("row", scores),
             "score_se": ("row", np.sqrt((deviations**2).sum(axis=0))),
             "score_deviation": (of_populations, deviations),
-            "pit": (("row", "observable"), np.stack([one.pit for one in courses])),
+            "pit": (("row", "observable"), pit),
             "effective_size": (of_populations, sizes),
             "n_alive": (of_populations, alive),
             "log_evidence_so_far": (of_populations, paths),

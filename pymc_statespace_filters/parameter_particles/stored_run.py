@@ -28,7 +28,7 @@ from ..smc.particles import Particles, Populations
 from ..system.clock import Clock
 from ..system.graph_digest import described, digest, graph_digest
 from .observed_rows import ObservedRows
-from .particle_request import Request
+from .particle_request import Request, columns_of, steps_of
 from .sequential_run import Progress, RowCourse, n_members
 
 GROUP = "smc_state"
@@ -127,8 +127,7 @@ def _populations(arrays: Mapping[str, np.ndarray], prefix: str) -> Populations:
 
 def arrays_of_progress(progress: Progress) -> dict[str, np.ndarray]:
     """Where a run stands, on its way through a record that is known."""
-    columns = zip(*progress.courses, strict=True)
-    courses = {f"row_{k}": np.array(c) for k, c in zip(RowCourse._fields, columns, strict=True)}
+    courses = {f"row_{name}": values for name, values in columns_of(progress.courses).items()}
     members = {"n_members": np.array(n_members(progress.rows))}
     return arrays_of_cloud(progress.cloud) | courses | members
 
@@ -137,9 +136,7 @@ def progress_of_arrays(arrays: Mapping[str, np.ndarray], rows: ObservedRows) -> 
     """The same from these arrays and the record."""
     if (size := int(arrays["n_members"])) != n_members(rows):
         rows = rows.of_size(size)
-    columns = [arrays[f"row_{name}"] for name in RowCourse._fields]
-    courses = [RowCourse(*one) for one in zip(*columns, strict=True)]
-    return Progress(rows, cloud_of_arrays(arrays), courses)
+    return Progress(rows, cloud_of_arrays(arrays), steps_of(RowCourse, arrays, "row_"))
 
 
 def _record(state: xr.Dataset, rows: ObservedRows) -> Record:
@@ -151,9 +148,9 @@ def _record(state: xr.Dataset, rows: ObservedRows) -> Record:
 
 
 def _courses(course: xr.Dataset) -> list[RowCourse]:
-    columns = [course[_PATHS.get(name, name)].transpose("row", ...) for name in RowCourse._fields]
-    rows = zip(*(column.values for column in columns), strict=True)
-    return [RowCourse(*row) for row in rows]
+    by_row = {name: course[_PATHS.get(name, name)] for name in RowCourse._fields}
+    arrays = {name: one.transpose("row", ...).values for name, one in by_row.items()}
+    return steps_of(RowCourse, arrays)
 
 
 def _identity(rows: ObservedRows) -> str:

@@ -16,7 +16,7 @@ from ..pymc_model.other_filter import model_with
 from ..pymc_model.prior import ModelFactors
 from ..smc.bridge import Cloud, Crossed, Stage, cross
 from ..smc.particles import Evaluate, Particles
-from .particle_request import Request, Run, check_alive
+from .particle_request import Request, Run, check_alive, columns_of, steps_of
 from .stored_run import arrays_of_cloud, cloud_of_arrays
 from .stored_steps import StoredSteps
 
@@ -152,8 +152,7 @@ def _stored(
     so_far: Crossed, visited: Visited | None, rng: np.random.Generator
 ) -> dict[str, np.ndarray]:
     """How far a run is, and its next random numbers, as arrays."""
-    columns = zip(*so_far.stages, strict=True)
-    stages = {f"stages_{name}": np.array(c) for name, c in zip(Stage._fields, columns, strict=True)}
+    stages = {f"stages_{name}": values for name, values in columns_of(so_far.stages).items()}
     generator = np.array(json.dumps(rng.bit_generator.state))
     found = {"log_ratio": so_far.log_ratio, "generator": generator}
     if visited is not None:
@@ -164,20 +163,13 @@ def _stored(
 def _restored(arrays: Mapping[str, np.ndarray], rng: np.random.Generator) -> Crossed:
     """The same from arrays; the generator is set."""
     rng.bit_generator.state = json.loads(str(arrays["generator"]))
-    columns = [arrays[f"stages_{name}"] for name in Stage._fields]
-    stages = [Stage(*one) for one in zip(*columns, strict=True)]
+    stages = steps_of(Stage, arrays, "stages_")
     return Crossed(cloud_of_arrays(arrays), arrays["log_ratio"], stages)
 
 
 def _course(stages: list[Stage]) -> xr.Dataset:
     """What happened at each temperature."""
-    columns = {
-        "temperature": [one.temperature for one in stages],
-        "n_steps": [one.n_steps for one in stages],
-        "acceptance": [one.acceptance for one in stages],
-        "scale": [one.scale for one in stages],
-        "n_evaluated": [one.n_evaluated for one in stages],
-    }
+    columns = columns_of(stages)
+    sizes = columns.pop("effective_sizes").T
     found = xr.Dataset({name: ("stage", values) for name, values in columns.items()})
-    sizes = np.stack([one.effective_sizes for one in stages], axis=1)
     return found.assign(effective_size=(("population", "stage"), sizes))
