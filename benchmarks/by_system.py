@@ -24,7 +24,7 @@ from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.parameters import flat_parameters
-from pymc_statespace_filters.system.record import checked_record
+from pymc_statespace_filters.system.record import read_record
 
 N_SEEDS, LEAST_SEEDS, MOST_SECONDS = 50, 10, 60.0  # for one filter on one record
 TRUTH_SEEDS = np.arange(50)
@@ -87,7 +87,7 @@ def measure(case: Case, filter, exact: float) -> Cell:
     check_system_and_filter(case.system, filter)
     run = evaluator(LogLikelihood(case.system, filter))
     given = flat_parameters(case.system, case.given)
-    record = checked_record(
+    record = read_record(
         case.system, GivenRecord(case.observed, steps=case.steps, inputs=case.inputs)
     ).arguments
     totals = []

@@ -18,7 +18,7 @@ from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.parameters import flat_parameters
-from pymc_statespace_filters.system.record import checked_record
+from pymc_statespace_filters.system.record import read_record
 
 TABLE = Path(__file__).parents[1] / "docs" / "_static" / "collapse_warning.inc"
 RECORDS = ("double well", "double well, sparse", "surprises", "counts", "sign lost")
@@ -32,7 +32,7 @@ def errors_and_warnings(case: Case, filter, exact: float) -> tuple[np.ndarray, n
     """Of every seed: the error in nats, and whether the filter warns of collapse."""
     run = evaluator(LogLikelihood(case.system, filter))
     given = flat_parameters(case.system, case.given)
-    record = checked_record(
+    record = read_record(
         case.system, GivenRecord(case.observed, steps=case.steps, inputs=case.inputs)
     ).arguments
     found = [run(given, *record, np.asarray(seed))[:2] for seed in range(N_SEEDS)]

@@ -18,7 +18,7 @@ from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.parameters import flat_parameters
-from pymc_statespace_filters.system.record import checked_record
+from pymc_statespace_filters.system.record import read_record
 
 OSCILLATOR = psf.StateSpaceModel(
     transition=psf.EulerMaruyama(
@@ -63,7 +63,7 @@ def costs(filter) -> dict[str, float]:
     for name, system in SYSTEMS.items():
         run = evaluator(LogLikelihood(system, filter))
         theta = flat_parameters(system, {one: TRUTH[one] for one in system.parameters})
-        arguments = (theta, *checked_record(system, GivenRecord(record, steps=steps)).arguments)
+        arguments = (theta, *read_record(system, GivenRecord(record, steps=steps)).arguments)
         contenders[name] = Timed(lambda seed, run=run, given=arguments: run(*given, np.int64(seed)))
         contenders[name].warm_up()
     return {name: timing.median for name, timing in in_turn(contenders, 9).items()}

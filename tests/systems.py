@@ -17,7 +17,7 @@ from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.parameters import flat_parameters
-from pymc_statespace_filters.system.record import checked_record
+from pymc_statespace_filters.system.record import read_record
 from pymc_statespace_filters.testing import kalman_log_likelihood
 from tests.references.records import DoubleWell, LinearSystem
 
@@ -256,6 +256,6 @@ def log_likelihoods(system, filter, params, seeds, **record):
     run = evaluator(LogLikelihood(system, filter))
     arguments = (
         flat_parameters(system, params),
-        *checked_record(system, GivenRecord(**record)).arguments,
+        *read_record(system, GivenRecord(**record)).arguments,
     )
     return np.array([run(*arguments, seed)[0].sum() for seed in seeds])

@@ -363,7 +363,7 @@ def test_a_wrong_record_is_refused(name):
     ("changes", "words"),
     [
         (dict(steps=[1, 0]), "followed by 0"),
-        (dict(params={"a": [1.0, 2.0]}), "simulate takes one value per parameter"),
+        (dict(params={"a": [1.0, 2.0]}), "params must have one value per parameter"),
         (dict(params={}), "no value for the parameters"),
         (dict(random_seed="today"), "random_seed"),
         (dict(system="system"), "system must be a StateSpaceModel"),

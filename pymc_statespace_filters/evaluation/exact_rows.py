@@ -1,55 +1,44 @@
 """Rows that fix more numbers exactly than are random: a record without a density."""
 
-from collections.abc import Sequence
-from typing import Any
-
 import numpy as np
 from pytensor.compile.sharedvalue import SharedVariable
-from pytensor.graph.basic import Constant
 
 from ..compiler.lowering.compiled_system import compile_system
 from ..compiler.lowering.directions import Directions
 from ..errors import ModelError
-from ..system.model import StateSpaceModel
-from ..system.time_axis import TimeAxis
+from ..system.record import Record
 
 
-def check_exact_rows(
-    system: StateSpaceModel,
-    axes: Sequence[TimeAxis],
-    observed: Any,
-    labels: Sequence[Any] | None = None,
-) -> None:
+def check_exact_rows(record: Record) -> None:
     """Raise if sensors without noise see more numbers than are random: stochastic singularity.
 
     The predicted covariance of such a row is singular, and the likelihood that a filter computes is
-    rounding, which may be finite. ``observed`` (J, p), an array or a symbol, has the rows of all
-    records one below the other; ``labels`` are the records of a panel.
+    rounding, which may be finite.
     """
+    observed, system = record.observed, record.system
     if isinstance(observed, SharedVariable):
         observed = observed.get_value()
-    elif isinstance(observed, Constant):
-        observed = observed.data
     compiled = compile_system(system)
     if not (isinstance(observed, np.ndarray) and compiled.has_exact_sensor):
         return
-    directions, start = compiled.directions, 0
-    for number, axis in enumerate(axes):
-        rows = observed[start : start + axis.steps.size]
+    directions = compiled.directions
+    for label, axis, own in zip(
+        record.records.labels, record.axes, record.records.slices(), strict=True
+    ):
+        rows = observed[own]
         if (found := _singular_row(directions, axis.steps, rows)) is not None:
             row, n_random = found
             seen = np.flatnonzero(directions.exact & ~np.isnan(rows[row]))
             names = ", ".join(system.observables[i] for i in seen)
-            record = "" if labels is None else f" of the record {labels[number]!r}"
+            of_record = f" of the record {label!r}" if record.is_panel else ""
             raise ModelError(
-                f"observed has a stochastic singularity in row {start + row}{record}, at step "
-                f"{axis.steps[row]}: the sensors without noise, {names}, fix {len(seen)} "
+                f"observed has a stochastic singularity in row {own.start + row}{of_record}, at "
+                f"step {axis.steps[row]}: the sensors without noise, {names}, fix {len(seen)} "
                 f"number{'s' * (len(seen) > 1)}, and at most {n_random} can vary given the rows "
                 "before, so that the record has no density. Give sensors noise "
                 "(observation_noise), leave one out (NaN in its column), or let more independent "
                 "noises reach the state"
             )
-        start += len(rows)
 
 
 def _singular_row(

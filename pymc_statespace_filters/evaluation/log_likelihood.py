@@ -20,9 +20,8 @@ from ..parallel.communicator import Communicator, communicator_of
 from ..system.checks import check_count
 from ..system.given_record import GivenRecord
 from ..system.model import StateSpaceModel
-from ..system.panel import CheckedPanel, checked_panel
 from ..system.parameters import flat_parameters, panel_parameters
-from ..system.record import check_seed, checked_record
+from ..system.record import Record, check_seed, read_record
 from .exact_rows import check_exact_rows
 from .health import tell_of_health
 
@@ -113,15 +112,16 @@ def log_likelihood(
     check_system_and_filter(system, filter)
     tell_of_choice(system, filter)
     given = GivenRecord(observed, panel, steps, times, inputs, t0, unit, input_times, inputs_at)
-    if panel is not None:
-        return _of_panel(system, filter, params, given, seed, comm, cores)
-    if check_count("cores", cores, 1) > 1:
+    n_threads, seeds = check_count("cores", cores, 1), check_seed("seed", seed)
+    record = read_record(system, given)
+    check_exact_rows(record)
+    if record.is_panel:
+        if comm is not None:
+            raise ModelError("comm must be None for a panel: every rank evaluates all records")
+        return _of_panel(record, filter, params, seeds, n_threads)
+    if n_threads > 1:
         raise ModelError(f"cores must be 1 without a panel, whose records it divides, got {cores}")
-    placed = checked_record(system, given)
-    system, record = placed.system, placed.arguments
-    check_exact_rows(system, [placed.axis], placed.observed)
     theta = flat_parameters(system, params)
-    seeds = check_seed("seed", seed)
     try:
         shape = np.broadcast_shapes(theta.shape[:-1], seeds.shape)
     except ValueError:
@@ -134,64 +134,45 @@ def log_likelihood(
     points = np.ascontiguousarray(theta).reshape(seeds.size, theta.shape[-1])
     with communicator_of(comm) as ranks:
         if ranks.size > 1:
-            _check_agreement(ranks, filter, (points, *record, seeds))
-        terms, health = _evaluate(system, filter, points, record, seeds.ravel(), ranks)
+            _check_agreement(ranks, filter, (points, *record.arguments, seeds))
+        terms, health = _at_points(record, filter, points, seeds.ravel(), ranks)
         if ranks.rank == 0:
             flat = seeds.ravel()
-            tell_of_health(system, filter, health, lambda i: (points[i], *record, flat[i]))
-    return terms.reshape(*shape, record[0].size)
+            tell_of_health(
+                record.system, filter, health, lambda i: (points[i], *record.arguments, flat[i])
+            )
+    return terms.reshape(*shape, record.steps.size)
 
 
 def _of_panel(
-    system: StateSpaceModel,
-    filter: Filter,
-    params: Any,
-    given: GivenRecord,
-    seed: Any,
-    comm: Any,
-    cores: Any,
+    record: Record, filter: Filter, params: Any, seed: np.ndarray, n_threads: int
 ) -> np.ndarray:
-    n_threads = check_count("cores", cores, 1)
-    if comm is not None:
-        raise ModelError("comm must be None for a panel: every rank evaluates all records")
-    table = checked_panel(system, given)
-    system = table.system
-    check_exact_rows(system, table.axes, table.observed, table.records.labels)
-    theta = panel_parameters(system, params, table.records)
-    seeds = check_seed("seed", seed)
-    if seeds.ndim:
-        raise ModelError(f"seed must be one number for a panel, got shape {seeds.shape}")
+    """Terms of all records, which threads share; if some fail, each is repeated to say which."""
+    if seed.ndim:
+        raise ModelError(f"seed must be one number for a panel, got shape {seed.shape}")
+    system, records = record.system, record.records
+    theta = panel_parameters(system, params, records)
     evaluate = evaluator(LogLikelihood(system, filter, PANEL))
-    starts = table.records.starts
 
     def part(first: int, last: int) -> tuple:
-        rows = slice(starts[first], starts[last])
-        data = table.rows[rows], table.observed[rows], table.inputs, table.t0
-        return evaluate(theta[first:last], *data, seeds)
+        rows = slice(records.starts[first], records.starts[last])
+        data = record.steps[rows], record.observed[rows], record.inputs, record.t0
+        return evaluate(theta[first:last], *data, seed)
 
-    n_parts = min(n_threads, len(starts) - 1)
-    ends = np.linspace(0, len(starts) - 1, n_parts + 1).astype(int)
+    n_parts = min(n_threads, len(theta))
+    ends = np.linspace(0, len(theta), n_parts + 1).astype(int)
     if n_parts > 1:
         part(0, 0)  # compiles, before there are threads
     with ThreadPoolExecutor(n_parts) as pool:
         found = list(pool.map(part, ends[:-1], ends[1:]))
-    health = [one for _, one in found]
-    if any(one[1] != NONE or one[0] < COLLAPSED for one in health):
-        _warn_of_records(system, filter, theta, table, seeds)
+    if any(health[1] != NONE or health[0] < COLLAPSED for _, health in found):
+        seeds = seeds_of_records(seed, records.codes)
+        each = zip(theta, record.each(), seeds, strict=True)
+        arguments = [(own, *rows, own_seed) for own, rows, own_seed in each]
+        repeated = evaluator(LogLikelihood(system, filter))
+        health = np.array([repeated(*one)[1] for one in arguments])
+        tell_of_health(system, filter, health, lambda g: arguments[g], labels=record.labels)
     return np.concatenate([terms for terms, _ in found])
-
-
-def _warn_of_records(
-    system: StateSpaceModel, filter: Filter, theta: np.ndarray, table: CheckedPanel, seed: Any
-) -> None:
-    """Repeat every record alone, and warn of those that failed or collapsed."""
-    evaluate = evaluator(LogLikelihood(system, filter))
-    seeds = seeds_of_records(seed, table.records.codes)
-    parts = zip(theta, table.single_records(), seeds, strict=True)
-    arguments = [(own, *record, own_seed) for own, record, own_seed in parts]
-    health = np.array([evaluate(*each)[1] for each in arguments])
-    labels = table.records.labels
-    tell_of_health(system, filter, health, lambda g: arguments[g], labels=labels)
 
 
 def _check_agreement(ranks: Communicator, filter: Filter, arrays: Sequence[np.ndarray]) -> None:
@@ -208,22 +189,18 @@ def _check_agreement(ranks: Communicator, filter: Filter, arrays: Sequence[np.nd
             )
 
 
-def _evaluate(
-    system: StateSpaceModel,
-    filter: Filter,
-    points: np.ndarray,
-    record: tuple,
-    seeds: np.ndarray,
-    ranks: Communicator,
+def _at_points(
+    record: Record, filter: Filter, points: np.ndarray, seeds: np.ndarray, ranks: Communicator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Terms and health of every point: as a batch if the filter has one, else one by one."""
+    """Terms and health of every point: side by side if the filter can, else one by one."""
+    system, arguments = record.system, record.arguments
     check_ranks(filter, ranks.size)
     if len(points) > 1 and isinstance(filter, BatchFilter):
         # A filter with batches is deterministic: any seed will do.
-        return evaluator(LogLikelihood(system, filter, POINTS))(points, *record, seeds[0])
+        return evaluator(LogLikelihood(system, filter, POINTS))(points, *arguments, seeds[0])
     evaluate = distributed_evaluator(system, filter, ranks)
-    terms = np.empty((len(points), record[0].size))
+    terms = np.empty((len(points), record.steps.size))
     health = np.empty((len(points), HEALTH_SIZE))
     for i, point in enumerate(points):
-        terms[i], health[i] = evaluate(point, *record, np.asarray(seeds[i]))
+        terms[i], health[i] = evaluate(point, *arguments, np.asarray(seeds[i]))
     return terms, health

@@ -20,10 +20,9 @@ from ..system.given_record import GivenRecord
 from ..system.input_columns import resets_at, with_resets
 from ..system.model import StateSpaceModel
 from ..system.own_units import in_own_units, law_in_own_units, moments_of_members
-from ..system.panel import CheckedPanel, checked_panel
-from ..system.parameters import flat_parameters, panel_parameters
+from ..system.parameters import panel_parameters
 from ..system.placement import Earlier
-from ..system.record import CheckedRecord, check_seed, checked_record
+from ..system.record import check_seed, read_record
 from ..system.steps import check_at, rows_at
 from .exact_rows import check_exact_rows
 from .health import tell_of_health
@@ -135,30 +134,19 @@ def run_filter(
     earlier = None
     if state is not None:
         system, earlier = _earlier(system, state)
-    labels = None
-    table: CheckedRecord | CheckedPanel
-    if panel is None:
-        table = checked_record(system, given, earlier)
-        theta = flat_parameters(system, params)
-        if theta.ndim != 1:
-            raise ModelError(
-                f"run_filter takes one value per parameter, got arrays of {theta.shape[:-1]}"
-            )
-        arguments: list[Any] = [(theta, *table.arguments, noise)]
-    else:
-        table = checked_panel(system, given, earlier)
-        labels = table.records.labels
-        of_records = panel_parameters(system, params, table.records)
-        seeds = seeds_of_records(noise, table.records.codes)
-        of_each = zip(of_records, table.single_records(), seeds, strict=True)
-        arguments = [(own, *record, own_seed) for own, record, own_seed in of_each]
-    system = table.system
-    common = attributes(system, filter, [each[0] for each in arguments], noise, arguments[0][4])
-    axes = [table.axis] if isinstance(table, CheckedRecord) else table.axes
+    record = read_record(system, given, earlier)
+    system, axes, labels = record.system, record.axes, record.labels
+    of_each = list(panel_parameters(system, params, record.records))
+    seeds = seeds_of_records(noise, record.records.codes) if record.is_panel else [noise]
+    arguments: list[Any] = [
+        (theta, *alone, seed)
+        for theta, alone, seed in zip(of_each, record.each(), seeds, strict=True)
+    ]
+    common = attributes(system, filter, of_each, noise, record.t0)
     if state is None:
-        check_exact_rows(system, axes, table.observed, labels)
+        check_exact_rows(record)
     ends = [float(axis.times(axis.steps[-1])) for axis in axes]
-    clock = table.clock.stored() | {"ends": ends}
+    clock = record.clock.stored() | {"ends": ends}
     if system.accumulators:
         clock[_RESETS] = np.concatenate([resets_at(system, each[2][-1]) for each in arguments])
     first = [np.int64(0)] * len(arguments)
@@ -192,11 +180,10 @@ def run_filter(
         evaluate = evaluator(States(system, check_states_filter(filter), "most probable"))
         paths = [evaluate(*each, own, 0)[0] for each, own in zip(arguments, rows, strict=True)]
         dataset["most_probable_path"] = (row_dim, "state"), np.concatenate(paths)
-    coords: dict[str, Any]
-    if isinstance(table, CheckedRecord):
-        coords = {row_dim: table.times(rows[0]), term_dim: table.times(at_steps[0])}
+    if record.is_panel:
+        coords: Any = record.coords(row_dim, rows) | record.coords(term_dim, at_steps, "obs_")
     else:
-        coords = table.coords(row_dim, rows) | table.coords(term_dim, at_steps, "obs_")
+        coords = {row_dim: record.times(rows), term_dim: record.times(at_steps)}
     return dataset.assign_coords(coords).assign_attrs(common, at=at, **clock)
 
 

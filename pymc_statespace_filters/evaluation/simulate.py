@@ -24,9 +24,8 @@ from ..system.checks import check_flag, check_random_seed
 from ..system.given_record import GivenRecord
 from ..system.model import StateSpaceModel
 from ..system.own_units import in_own_units
-from ..system.panel import checked_panel
-from ..system.parameters import flat_parameters, panel_parameters
-from ..system.record import check_system, checked_record
+from ..system.parameters import panel_parameters
+from ..system.record import Record, check_system, read_record
 
 _MANY_STEPS = 100_000  # some milliseconds at the least
 
@@ -308,33 +307,31 @@ def simulate(
     """
     check_system(system)
     given = GivenRecord(None, panel, steps, times, inputs, t0, unit, input_times, inputs_at)
-    if panel is not None:
-        return _simulate_panel(system, params, given, noise, random_seed)
-    record = checked_record(system, given)
-    system, (at, _, forces, _) = record.system, record.arguments
-    theta = flat_parameters(system, params)
-    if theta.ndim != 1:
-        raise ModelError(
-            f"simulate takes one value per parameter, got arrays of {theta.shape[:-1]}"
-        )
-    with_noise = check_flag("noise", noise)
+    record = read_record(system, given)
+    system, records = record.system, record.records
+    parameters = panel_parameters(system, params, records)
+    run = simulator(system, check_flag("noise", noise)).function
     rng = check_random_seed(random_seed)
-    run = simulator(system, with_noise).function
-    states, observations = _run(run, rng, theta, at, forces, record.axis.t0)
-    _warn_unless_finite(observations, lambda j: f"at time {record.times(at[j : j + 1])[0]}")
-    n_steps = np.arange(states.shape[0])
+    own_rngs = generators_of_records(rng, records.codes) if record.is_panel else [rng]
+    simulated = [
+        _run(run, own_rng, theta, at, rows, float(t0))
+        for own_rng, theta, (at, _, rows, t0) in zip(
+            own_rngs, parameters, record.each(), strict=True
+        )
+    ]
+    states, observations = (np.concatenate(parts) for parts in zip(*simulated, strict=True))
+    _warn_unless_finite(observations, record)
+    dim = "row" if record.is_panel else "step"
     return xr.Dataset(
         {
-            "states": (("step", "state"), in_own_units(system, states)),
+            "states": ((dim, "state"), in_own_units(system, states)),
             "observations": (("obs", "observable"), observations),
         },
         coords={
-            "step": n_steps,
             "state": list(system.states),
-            "obs": at,
             "observable": list(system.observables),
-            "time": ("step", record.times(n_steps)),
-            "obs_time": ("obs", record.times(at)),
+            **record.coords(dim, [np.arange(len(path)) for path, _ in simulated]),
+            **record.coords("obs", [axis.steps for axis in record.axes], "obs_"),
         },
     )
 
@@ -345,51 +342,18 @@ def _run(run: Callable, rng: np.random.Generator, theta: np.ndarray, steps: Any,
     return (call_in_thread if is_long else call_machine_code)(run, rng, theta, steps, *rest)
 
 
-def _warn_unless_finite(observations: np.ndarray, place: Callable[[int], str]) -> None:
+def _warn_unless_finite(observations: np.ndarray, record: Record) -> None:
     """Warn of numbers that a filter would take for missing observations, or refuse."""
     if (failed := np.flatnonzero(~np.isfinite(observations).all(axis=1))).size:
         row = int(failed[0])
+        place = f"at time {record.times([axis.steps for axis in record.axes])[row]}"
+        if record.is_panel:
+            place = f"of record {record.records.labels[record.records.of_rows()[row]]!r}"
         warnings.warn(
             f"{failed.size} of {len(observations)} simulated observations are not finite, the "
-            f"first in row {row}, {place(row)}: the state overflows, or a covariance or a "
+            f"first in row {row}, {place}: the state overflows, or a covariance or a "
             "parameter of a distribution is invalid at these parameters. A filter takes NaN for a "
             "missing observation.",
             ModelWarning,
             skip_file_prefixes=INSIDE,
         )
-
-
-def _simulate_panel(
-    system: StateSpaceModel,
-    params: Mapping[str, Any],
-    given: GivenRecord,
-    noise: bool,
-    random_seed: Any,
-) -> xr.Dataset:
-    """Simulate every record with a generator of its own."""
-    table = checked_panel(system, given)
-    system = table.system
-    theta = panel_parameters(system, params, table.records)
-    run = simulator(system, check_flag("noise", noise)).function
-    generators = generators_of_records(check_random_seed(random_seed), table.records.codes)
-    records = table.single_records()
-    simulated = [
-        _run(run, rng, own, steps, inputs, float(t0))
-        for rng, own, (steps, _, inputs, t0) in zip(generators, theta, records, strict=True)
-    ]
-    states, observations = (np.concatenate(parts) for parts in zip(*simulated, strict=True))
-    labels, of_rows = table.records.labels, table.records.of_rows()
-    _warn_unless_finite(observations, lambda j: f"of record {labels[of_rows[j]]!r}")
-    n_steps = [np.arange(len(path)) for path, _ in simulated]
-    return xr.Dataset(
-        {
-            "states": (("row", "state"), in_own_units(system, states)),
-            "observations": (("obs", "observable"), observations),
-        },
-        coords={
-            "state": list(system.states),
-            "observable": list(system.observables),
-            **table.coords("row", n_steps),
-            **table.coords("obs", [axis.steps for axis in table.axes], "obs_"),
-        },
-    )

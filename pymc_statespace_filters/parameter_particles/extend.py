@@ -16,7 +16,7 @@ from ..system.clock import times_of_data
 from ..system.given_record import GivenRecord
 from ..system.input_columns import inputs_of_user, resets_at, with_resets
 from ..system.placement import Earlier
-from ..system.record import CheckedRecord, check_observed, checked_record
+from ..system.record import check_observed, read_record
 from ..system.steps import GRID_TOLERANCE, check_steps
 from .filter_doubts import kept_from
 from .observed_rows import ObservedRows
@@ -128,9 +128,7 @@ def extend(
         return finished(progress, request, kept_from(idata), StoredSteps(), progressbar=progressbar)
 
 
-def _new_rows(
-    rows: ObservedRows, observed: Any, steps: Any, times: Any, inputs: Any
-) -> CheckedRecord:
+def _new_rows(rows: ObservedRows, observed: Any, steps: Any, times: Any, inputs: Any) -> Record:
     """The rows that come after those seen, as a record of their own; the others must agree."""
     system, clock = rows.variable.system, rows.variable.clock
     if steps is None and times is None:
@@ -151,13 +149,13 @@ def _new_rows(
     ends = [float(rows.seen_times[-1])] if system.is_at_any_times else None
     earlier = Earlier(clock, float(rows.record.t0), [int(rows.record.steps[-1])], ends)
     new = GivenRecord(values[n_old:], **{name: given[n_old:]}, inputs=inputs, t0=earlier.t0)
-    found = checked_record(system, new, earlier)
+    found = read_record(system, new, earlier)
     if found.system != system:
         raise ModelError(
             "times must lie on the grid of steps t0 + k*dt, as those of the run do: round with "
             "psf.nearest_steps, or run sample_smc over all rows"
         )
-    return found
+    return Record(*found.arguments)
 
 
 def _check_agree(
@@ -179,7 +177,7 @@ def _check_agree(
             )
 
 
-def _longer(rows: ObservedRows, new: CheckedRecord) -> Record:
+def _longer(rows: ObservedRows, new: Record) -> Record:
     """The record seen and the new rows behind it."""
     seen, system = rows.record, rows.variable.system
     last = int(seen.steps[-1])
@@ -195,5 +193,5 @@ def _longer(rows: ObservedRows, new: CheckedRecord) -> Record:
             )
         inputs[:last] = seen.inputs[:last]
         inputs[last] = with_resets(system, inputs[last], resets_at(system, seen.observed[-1]))
-    steps = np.concatenate([seen.steps, new.axis.steps])
+    steps = np.concatenate([seen.steps, new.steps])
     return Record(steps, np.concatenate([seen.observed, new.observed]), inputs, seen.t0)

@@ -22,14 +22,13 @@ from ..system.checks import is_integer
 from ..system.clock import Clock
 from ..system.given_record import GivenRecord
 from ..system.model import StateSpaceModel
-from ..system.panel import SymbolicPanel, symbolic_panel
 from ..system.parameters import (
     check_names,
     known_elements,
     symbolic_panel_parameters,
     symbolic_parameters,
 )
-from ..system.record import check_seed, check_system, symbolic_record
+from ..system.record import Record, check_seed, check_system, read_record
 from ..system.timed_inputs import TimedInputs
 from . import dispatch as dispatch  # registers draw and density
 from .missing_codes import warn_of_missing_codes
@@ -179,27 +178,25 @@ class StateSpace(Continuous):
         full_name = model.name_for(name)
         _check_name(model, full_name, name, system)
         given = GivenRecord(observed, panel, steps, times, inputs, t0, unit, input_times, inputs_at)
-        record: Any
+        record = read_record(system, given, symbolic=True)
+        check_exact_rows(record)
         if panel is None:
             theta = symbolic_parameters(system, values, others)
-            record = symbolic_record(system, given)
-            check_exact_rows(record.system, [record.axis], record.observed)
-            n_rows, t0 = record.axis.steps.size, record.axis.t0
             row_dim, component_dim = _dims(dims, f"{full_name}_time")
-            row_coords: Any = record.clock.shown(record.axis.times(record.axis.steps))
+            row_coords: Any = record.times([axis.steps for axis in record.axes])
         else:
-            record = symbolic_panel(system, given)
-            check_exact_rows(record.system, record.axes, record.observed, record.records.labels)
             values = in_order_of_records(system, values, model, record)
             theta = symbolic_panel_parameters(system, values, record, others)
-            n_rows, t0 = int(np.diff(record.records.starts).max()), record.t0
             row_dim, component_dim = _dims(dims, f"{full_name}_obs")
             row_coords = range(int(record.records.starts[-1]))
+        n_rows = int(np.diff(record.records.starts).max())
         seed_array = check_seed("seed", seed)
         if seed_array.ndim:
             raise ModelError(f"seed must be one integer, got an array of shape {seed_array.shape}")
-        warn_of_no_data(name, record.observed)
-        warn_of_missing_codes(name, record.observed, system.observables)
+        # A symbol, because PyMC would mask and impute the NaN of an array.
+        data = None if record.observed is None else pt.as_tensor(record.observed)
+        warn_of_no_data(name, data)
+        warn_of_missing_codes(name, data, system.observables)
         _add_coord(model, row_dim, row_coords, name)
         _add_coord(model, component_dim, list(system.observables), name)
         if panel is not None:
@@ -212,16 +209,16 @@ class StateSpace(Continuous):
             cls,
             name,
             theta,
-            record.steps if panel is None else record.rows,
+            record.steps,
             record.inputs,
-            t0,
+            record.t0,
             noise_seed,
             system=record.system,
             filter=filter,
             score_from=_check_score_from(score_from, n_rows, system, filter),
             clock=record.clock,
             timed=record.timed,
-            observed=record.observed,
+            observed=data,
             dims=(row_dim, component_dim),
         )
 
@@ -320,13 +317,13 @@ def _dims(dims: Sequence[str] | None, of_rows: str) -> tuple[str, str]:
     return row_dim, component_dim
 
 
-def _add_records(model: pm.Model, name: str, row_dim: str, panel: SymbolicPanel) -> None:
+def _add_records(model: pm.Model, name: str, row_dim: str, panel: Record) -> None:
     """Add the labels of a panel, and the record and time of every row, to the model.
 
     Rows given as ``pm.Data`` are in the model already, and may change.
     """
     _add_coord(model, f"{name}_record", panel.records.labels, name)
-    if isinstance(panel.rows, Variable):
+    if isinstance(panel.steps, Variable):
         return
     of_rows = panel.records.of_rows()
     if isinstance(panel.records.labels[0], int):

@@ -10,11 +10,11 @@ from pytensor.graph.basic import Variable
 from ..errors import ModelError
 from ..system.labels import positions_of
 from ..system.model import StateSpaceModel
-from ..system.panel import SymbolicPanel
+from ..system.record import Record
 
 
 def in_order_of_records(
-    system: StateSpaceModel, values: Mapping[str, Any], model: pm.Model, panel: SymbolicPanel
+    system: StateSpaceModel, values: Mapping[str, Any], model: pm.Model, panel: Record
 ) -> dict[str, Any]:
     """Values of parameters; those of each record are aligned by the coordinates of the records.
 
@@ -36,7 +36,7 @@ def in_order_of_records(
     }
 
 
-def _aligned(parameter: str, value: Any, model: pm.Model, panel: SymbolicPanel) -> Any:
+def _aligned(parameter: str, value: Any, model: pm.Model, panel: Record) -> Any:
     found, labels = _first_coordinates(value, model), panel.records.labels
     if found is None or found == labels:
         return value

@@ -26,10 +26,10 @@ from ..pymc_model.state_space_variable import (
     observed_variables,
     with_other_filter,
 )
+from ..system.given_record import of_each_record
 from ..system.input_columns import only_seen
-from ..system.panel import panel_inputs
-from ..system.panel_records import FIRST_INPUT, RECORD, STEP, records_of
-from ..system.record import check_inputs
+from ..system.panel_records import ALONE, FIRST_INPUT, RECORD, STEP, records_of
+from ..system.record import read_inputs
 from ..system.time_axis import TimeAxis
 from .draws import SAMPLE_DIMS, PosteriorDraws
 from .record import Array, RecordAtDraws
@@ -90,14 +90,15 @@ class VariableAtDraws:
     def with_inputs(self, inputs: Any, axes: Sequence[TimeAxis]) -> "VariableAtDraws":
         """The same with other inputs, for observations on the axis of every record."""
         variable, system = self.variable, self.variable.system
+        records, table = ALONE, self.records[0].steps
         if variable.is_panel:
             table = variable.steps.eval(mode="FAST_COMPILE")
             own = [record.label for record in self.records]
             records = records_of(table[:, RECORD])._replace(labels=own)
-            rows, firsts = panel_inputs(inputs, system, records, axes)
+        parts = of_each_record("inputs", inputs, records.labels)
+        rows, firsts = read_inputs(parts, system, records, axes)
+        if variable.is_panel:
             table[:, FIRST_INPUT] = 0 if firsts is None else firsts[records.of_rows()]
-        else:
-            rows, table = check_inputs(inputs, system, axes[0]), self.records[0].steps
         observed = np.concatenate([record.observed for record in self.records])
         rows = only_seen(system, rows, table, observed)
         changed = variable._replace(inputs=pt.as_tensor(rows), steps=pt.as_tensor(table))

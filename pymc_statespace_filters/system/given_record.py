@@ -40,19 +40,24 @@ class GivenRecord:
         )
         return replace(self, steps=steps, panel=panel)
 
+    def check_numbers(self) -> None:
+        """Raise if a part is a symbol."""
+        for name in ("observed", "panel", "steps", "inputs"):
+            value = getattr(self, name)
+            for part in value if isinstance(value, list | tuple) else [value]:
+                if isinstance(part, Variable):
+                    raise ModelError(f"{name} must be numbers, got a symbol")
+
     def placed(
-        self,
-        system: StateSpaceModel,
-        records: Records | None = None,
-        earlier: Earlier | None = None,
+        self, system: StateSpaceModel, records: Records, earlier: Earlier | None = None
     ) -> Placement:
-        """Where the observations lie, and inputs with times of their own; of a panel, by record."""
+        """Where the observations lie, and the inputs, of each record."""
         if isinstance(self.times, Variable):
             raise ModelError("times must be numbers, got a symbol; give steps=pm.Data(...) instead")
-        labels = [None] if records is None else records.labels
-        inputs, input_times = of_each_record("inputs", self.inputs, labels), None
+        inputs = of_each_record("inputs", self.inputs, records.labels)
+        input_times = None
         if self.input_times is not None:
-            input_times = of_each_record("input_times", self.input_times, labels)
+            input_times = of_each_record("input_times", self.input_times, records.labels)
             if any(isinstance(part, Variable) for part in inputs):
                 raise ModelError("inputs must be numbers where input_times are given, got a symbol")
         timing = Timing(
@@ -60,11 +65,9 @@ class GivenRecord:
             _by_record("times", self._own_times(records), records),
             self.t0, self.unit, inputs, input_times, self.inputs_at, earlier,
         )  # fmt: skip
-        return (
-            place(system, timing) if records is None else place(system, timing, records.check_each)
-        )
+        return place(system, timing, records.check_each)
 
-    def _own_times(self, records: Records | None) -> Any:
+    def _own_times(self, records: Records) -> Any:
         """The times that are given, else the dates that the data bring."""
         found = times_of_data(self.observed)
         for name in ("steps", "times", "panel"):
@@ -104,7 +107,7 @@ def _check_index(name: str, values: Any, observed: Any) -> None:
         )
 
 
-def _check_agree(times: Any, dates: Any, records: Records | None) -> None:
+def _check_agree(times: Any, dates: Any, records: Records) -> None:
     """Raise unless the dates of the data are the times that are given, or increase beside numbers.
 
     Data whose rows are in another order would be taken by position.
@@ -118,16 +121,16 @@ def _check_agree(times: Any, dates: Any, records: Records | None) -> None:
                 f"times must be the dates of observed, got times[{at}] = {given[at]}, where "
                 f"observed has {own[at]}: {remedy}"
             )
-    for rows in [slice(None)] if records is None else records.slices():
+    for rows in records.slices() if records.is_panel else [slice(None)]:
         if not pd.Index(dates[rows]).is_monotonic_increasing:
             raise ModelError(
                 "the dates of observed must increase, as steps and times do: sort its rows"
             )
 
 
-def _by_record(name: str, values: Any, records: Records | None) -> list[Any] | None:
+def _by_record(name: str, values: Any, records: Records) -> list[Any] | None:
     """What each row has, as a list with the rows of each record."""
-    if values is None or records is None:
+    if values is None or not records.is_panel:
         return None if values is None else [values]
     array = values if are_dates(values) else np.asarray(values)
     n_rows = int(records.starts[-1])

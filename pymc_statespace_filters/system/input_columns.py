@@ -70,35 +70,45 @@ def reset(
     return x
 
 
-def with_columns(system: "StateSpaceModel", inputs: np.ndarray, axis: TimeAxis) -> np.ndarray:
+def with_columns(
+    system: "StateSpaceModel", inputs: Any, axis: TimeAxis, steps: Variable | None = None
+) -> Any:
     """The user's inputs (..., rows, n_inputs) with all columns, of a record on this axis.
 
-    Accumulators are set to zero at every observation, until `only_seen` knows the data.
+    Accumulators are set to zero at every observation, until `only_seen` knows the data. Inputs
+    (rows, n_inputs) may be a symbol, and ``steps`` one for those of the axis.
     """
-    columns = []
-    if axis.lengths is not None and axis.starts is not None:
-        columns += [axis.lengths, axis.starts]
-    n_rows = inputs.shape[-2] if system.n_inputs else n_input_rows(system, axis.steps)
-    n_rows = n_rows if axis.starts is None else axis.starts.size
-    columns += [_moves(np.arange(n_rows), every, axis) for every in system.held_for]
-    if system.accumulators:
-        at_observation = np.zeros(n_rows)
-        at_observation[axis.steps[axis.steps < n_rows]] = 1.0
-        columns += [at_observation] * len(system.accumulators)
-    if not columns:
+    if system.n_input_columns == system.n_inputs:
         return inputs
-    own = np.stack(columns, axis=-1)
-    own = np.broadcast_to(own, (*inputs.shape[:-2], *own.shape))
+    xp: Any = pt if isinstance(inputs, Variable) or steps is not None else np
+    at: Any = axis.steps if steps is None else steps
+    if axis.starts is not None:
+        n_rows: Any = axis.starts.size
+    elif system.n_inputs:
+        n_rows = inputs.shape[-2]
+    else:
+        n_rows = n_input_rows(system, at) if xp is np else pt.max(pt.concatenate([at, [0]]))
+    columns: list[Any] = [axis.lengths, axis.starts] if axis.starts is not None else []
+    columns += [_moves(xp.arange(n_rows), every, axis) for every in system.held_for]
+    if system.accumulators:
+        at_observation = _replaced(xp.zeros(n_rows + 1), at, 1.0)
+        columns += [at_observation] * len(system.accumulators)
+    own = xp.stack(columns, axis=-1)
+    if xp is np:
+        own = np.broadcast_to(own, (*inputs.shape[:-2], *own.shape))
     if not system.n_inputs:
-        return own.copy()
-    return np.concatenate([_one_row_each(inputs, own.shape[-2]), own], axis=-1)
+        return own.copy() if xp is np else own
+    if axis.starts is not None:  # the last row may be missing
+        inputs = xp.concatenate([inputs, inputs[..., -1:, :]], axis=-2)[..., :n_rows, :]
+    return xp.concatenate([inputs, own], axis=-1)
 
 
-def _one_row_each(inputs: np.ndarray, n_rows: int) -> np.ndarray:
-    """Inputs (..., rows, n_inputs) of so many rows; the last row is repeated once if it lacks."""
-    if inputs.shape[-2] == n_rows - 1:
-        return np.concatenate([inputs, inputs[..., -1:, :]], axis=-2)
-    return inputs
+def _replaced(rows: Any, at: Any, values: Any) -> Any:
+    """Rows, of which some are others; what falls past the last row is cut off with it."""
+    if isinstance(rows, Variable):
+        return pt.set_subtensor(rows[pt.clip(at, 0, rows.shape[0] - 1)], values)[:-1]
+    rows[np.minimum(at, len(rows) - 1)] = values
+    return rows[:-1]
 
 
 def columns_between(
@@ -115,35 +125,6 @@ def columns_between(
         is_first = np.arange(len(inputs)) == 0
         own += [is_first * reset for reset in resets]
     return np.column_stack([inputs, *own])
-
-
-def with_symbolic_columns(
-    system: "StateSpaceModel", inputs: Any, steps: Any, axis: TimeAxis
-) -> TensorVariable:
-    """The same for symbols or numbers, inputs (rows, n_inputs) and steps (J,)."""
-    columns = []
-    if axis.lengths is not None and axis.starts is not None:
-        columns += [pt.as_tensor(axis.lengths), pt.as_tensor(axis.starts)]
-        n_rows: Any = axis.starts.size
-    elif system.n_inputs:
-        n_rows = pt.as_tensor(inputs).shape[0]
-    else:
-        n_rows = pt.max(pt.concatenate([pt.as_tensor(steps), [0]]))
-    columns += [_moves(pt.arange(n_rows), every, axis) for every in system.held_for]
-    if system.accumulators:
-        steps = pt.as_tensor(steps)
-        # Steps past the last row fall on one row more, which is cut off.
-        ones = pt.set_subtensor(pt.zeros(n_rows + 1)[pt.clip(steps, 0, n_rows)], 1.0)
-        columns += [ones[:-1]] * len(system.accumulators)
-    if not columns:
-        return inputs
-    own = pt.stack(columns, axis=1)
-    if not system.n_inputs:
-        return own
-    rows = pt.as_tensor(inputs)
-    if axis.starts is not None:  # its last row may be missing
-        rows = pt.concatenate([rows, rows[-1:]])[:n_rows]
-    return pt.concatenate([rows, own], axis=1)
 
 
 def _moves(number: Any, every: int, axis: TimeAxis) -> Any:
@@ -171,15 +152,12 @@ def only_seen(system: "StateSpaceModel", inputs: Any, steps: Any, observed: Any)
     inputs, steps, observed = (v.data if isinstance(v, Constant) else v for v in given)
     xp: Any = pt if any(isinstance(v, Variable) for v in (inputs, steps, observed)) else np
     seen, n_rows = seen_accumulators(system, observed), inputs.shape[-2]
-    # Steps past the last row fall on one row more, which is cut off.
-    at = xp.clip(_rows_of(steps, n_rows), 0, n_rows)
-    kept = xp.ones((n_rows + 1, n))
-    if xp is np:
-        kept[at] = seen
-    else:  # data of other rows, where new ones are not set yet, say nothing
+    at = _rows_of(steps, n_rows)
+    if xp is pt:  # data of other rows, where new ones are not set yet, say nothing
         n_known = pt.switch(pt.eq(at.shape[0], seen.shape[0]), seen.shape[0], 0)
-        kept = pt.set_subtensor(kept[at[:n_known]], seen[:n_known])
-    return xp.concatenate([inputs[..., :-n], inputs[..., -n:] * kept[:-1]], axis=-1)
+        at, seen = pt.as_tensor(at)[:n_known], pt.as_tensor(seen)[:n_known]
+    kept = _replaced(xp.ones((n_rows + 1, n)), at, seen)
+    return xp.concatenate([inputs[..., :-n], inputs[..., -n:] * kept], axis=-1)
 
 
 def seen_accumulators(system: "StateSpaceModel", observed: Any) -> Any:

@@ -1,4 +1,7 @@
-"""The records of a panel: their labels, their rows, and the codes on which their noise depends."""
+"""The records of a panel: their labels, their rows, and the codes on which their noise depends.
+
+A record without a panel is one without a label, and its code is 0.
+"""
 
 from collections.abc import Callable, Sequence
 from hashlib import blake2b
@@ -9,21 +12,26 @@ import numpy as np
 from ..errors import ModelError
 from .checks import is_integer, shortened
 
-# Columns of the rows of a panel, see `panel`.
+# Columns of the rows of a panel, see `record`.
 RECORD, STEP, FIRST_INPUT = range(3)
 N_COLUMNS = 3
 
 
 class Records(NamedTuple):
-    """The records of a panel, in the order of their rows.
+    """Records in the order of their rows.
 
-    ``labels`` has one label for each, ``starts`` (G + 1,) the first row of each and the number of
-    rows, ``codes`` (G,) what their noise depends on.
+    ``labels`` has one label for each, None without a panel, ``starts`` (G + 1,) the first row of
+    each and the number of rows, ``codes`` (G,) what their noise depends on.
     """
 
     labels: list[Any]
     starts: np.ndarray
     codes: np.ndarray
+
+    @property
+    def is_panel(self) -> bool:
+        """Whether the records have labels."""
+        return self.labels != [None]
 
     def slices(self) -> list[slice]:
         """The rows of each record."""
@@ -38,7 +46,9 @@ class Records(NamedTuple):
         return [values[rows] for rows in self.slices()]
 
     def check_each(self, check: Callable[..., Any], *parts: Sequence[Any]) -> list[Any]:
-        """Check what each record has; an error names the record and its first row."""
+        """Check what each record has; an error names the record of a panel and its first row."""
+        if not self.is_panel:
+            return [check(*own) for own in zip(*parts, strict=True)]
         found = []
         for label, first, *own in zip(self.labels, self.starts, *parts, strict=False):
             try:
@@ -46,6 +56,10 @@ class Records(NamedTuple):
             except ModelError as error:
                 raise ModelError(f"record {label!r}, whose first row is {first}: {error}") from None
         return found
+
+
+# A record without a panel, before the number of its rows is known.
+ALONE = Records([None], np.zeros(1, np.int64), np.zeros(1, np.int64))
 
 
 def records_of(panel: Any) -> Records:

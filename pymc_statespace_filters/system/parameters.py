@@ -13,8 +13,8 @@ from ..errors import ModelError
 from .equations import RESERVED
 from .labels import rows_in_order
 from .model import StateSpaceModel
-from .panel import SymbolicPanel
 from .panel_records import Records
+from .record import Record
 
 _OTHER_NUMBER = (
     "parameter {name!r} must have a value for each record; when pm.set_data changes the number of "
@@ -162,7 +162,14 @@ def numbers(name: str, value: Any) -> np.ndarray:
 def panel_parameters(
     system: StateSpaceModel, params: Mapping[str, Any], records: Records
 ) -> np.ndarray:
-    """Parameter values (G, k): each shared, or with a leading dimension of records."""
+    """Parameter values (G, k): each shared, or, of a panel, with a leading dimension of records."""
+    if not records.is_panel:
+        theta = flat_parameters(system, params)
+        if theta.ndim != 1:
+            raise ModelError(
+                f"params must have one value per parameter, got arrays of {theta.shape[:-1]}"
+            )
+        return theta[None]
     check_names(system, params)
     values = dict(system.defaults) | dict(params)
     check_complete(system, values)
@@ -178,7 +185,7 @@ def panel_parameters(
 def symbolic_panel_parameters(
     system: StateSpaceModel,
     values: Mapping[str, Any],
-    panel: SymbolicPanel,
+    panel: Record,
     others: Sequence[str],
 ) -> TensorVariable:
     """Parameter values, numbers or symbols, as a symbolic matrix (G, k)."""

@@ -8,6 +8,7 @@ import numpy as np
 from ..errors import ModelError
 from .clock import Clock, are_dates, check_zones, clock_and_start, unit_text
 from .model import StateSpaceModel
+from .panel_records import ALONE
 from .steps import GRID_TOLERANCE, check_steps
 from .time_axis import (
     TimeAxis,
@@ -81,13 +82,8 @@ class Placement(NamedTuple):
     timed: tuple[TimedInputs, ...] = ()
 
 
-def one_by_one(check: Callable[..., Any], *parts: Sequence[Any]) -> list[Any]:
-    """Check what each record has, where records need no name."""
-    return [check(*own) for own in zip(*parts, strict=True)]
-
-
 def place(
-    system: StateSpaceModel, timing: Timing, check_each: Callable[..., list[Any]] = one_by_one
+    system: StateSpaceModel, timing: Timing, check_each: Callable[..., list[Any]]
 ) -> Placement:
     """Find the steps of some records; ``check_each`` calls a check for each, see `Records`."""
     check_inputs_at(timing.inputs_at)
@@ -117,7 +113,7 @@ def place_by(
     system: StateSpaceModel,
     timing: Timing,
     numbers: Sequence[int],
-    check_each: Callable[..., list[Any]] = one_by_one,
+    check_each: Callable[..., list[Any]] = ALONE.check_each,
 ) -> Placement:
     """The same by a clock that is known, for the records of these numbers."""
     timed, input_times = None, timing.input_times

@@ -6,7 +6,8 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.evaluation.exact_rows import check_exact_rows
-from pymc_statespace_filters.system.time_axis import TimeAxis
+from pymc_statespace_filters.system.given_record import GivenRecord
+from pymc_statespace_filters.system.record import read_record
 from pymc_statespace_filters.testing import kalman_log_likelihood
 
 DT, STIFFNESS, DAMPING = 0.05, 2.0, 0.3
@@ -158,9 +159,9 @@ def test_refused_is_what_has_a_singular_joint_covariance(seed):
         if step in steps:
             rows.extend(C[exact & ~np.isnan(observed[steps == step][0])] @ state)
     has_density = not rows or np.linalg.matrix_rank(rows, tol=1e-9) == len(rows)
-    axis = TimeAxis(steps, 0.0, 1.0)
+    record = read_record(system, GivenRecord(observed, steps=steps))
     if has_density:
-        check_exact_rows(system, [axis], observed)
+        check_exact_rows(record)
     else:
         with pytest.raises(psf.errors.ModelError, match="stochastic singularity"):
-            check_exact_rows(system, [axis], observed)
+            check_exact_rows(record)

@@ -23,7 +23,7 @@ from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.ops.states import Predictions, States
 from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.parameters import flat_parameters
-from pymc_statespace_filters.system.record import checked_record
+from pymc_statespace_filters.system.record import read_record
 
 pytestmark = pytest.mark.usefixtures("interpreted")
 
@@ -94,7 +94,7 @@ def wear_paths(p, rate, observed, steps):
 
 def arguments_of(system, params, record):
     """The arguments of a likelihood."""
-    rows = checked_record(system, GivenRecord(**record)).arguments
+    rows = read_record(system, GivenRecord(**record)).arguments
     return (flat_parameters(system, params), *rows, 0)
 
 
@@ -433,7 +433,7 @@ def test_laws_of_observations():
     """PIT values of `filter_diagnostics` are those of the mixture over the predicted states."""
     arguments = (
         flat_parameters(SWITCH, GIVEN),
-        *checked_record(SWITCH, GivenRecord(**RECORD)).arguments,
+        *read_record(SWITCH, GivenRecord(**RECORD)).arguments,
         0,
     )
     mean, _, below, _ = evaluator(Predictions(SWITCH, psf.FiniteStateFilter()))(*arguments)

@@ -36,7 +36,7 @@ from pymc_statespace_filters.ops.distributed import (
 )
 from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.parameters import flat_parameters
-from pymc_statespace_filters.system.record import checked_record
+from pymc_statespace_filters.system.record import read_record
 from tests.filters.ensemble_contract import (
     LINE,
     LOST_START,
@@ -304,7 +304,7 @@ def test_counts_are_the_same_on_one_and_several_ranks():
         accumulators=["left"],
     )
     filter_, steps = BootstrapPF(200, resample_below=1), np.array([2, 4, 6])
-    record = checked_record(system, GivenRecord([60.0, 55.0, 70.0], steps=steps))
+    record = read_record(system, GivenRecord([60.0, 55.0, 70.0], steps=steps))
     arguments = np.array([0.1]), *record.arguments, 5
     terms = by_evaluators(system, filter_, arguments)
     alone = psf.log_likelihood(system, filter_, {"rate": 0.1}, record.observed, steps=steps, seed=5)

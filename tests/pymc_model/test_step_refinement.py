@@ -15,7 +15,7 @@ from pymc_statespace_filters.pymc_model.step_refinement import (
     step_stability,
 )
 from pymc_statespace_filters.system.given_record import GivenRecord
-from pymc_statespace_filters.system.record import checked_record
+from pymc_statespace_filters.system.record import read_record
 from tests.modes import AS_IT_STANDS
 
 OBSERVED = {"observation": lambda x: [x[0]], "observation_noise": [[0.1]]}
@@ -170,12 +170,12 @@ TIMES = np.array([0.03, 0.21, 0.3, 0.47])
 
 @pytest.mark.parametrize("substeps", [1, 2])
 def test_steps_of_a_record_at_any_times_have_their_own_lengths(substeps):
-    record = checked_record(
+    record = read_record(
         euler(lambda x, t, a: [a * t * x[0]], substeps=substeps),
         GivenRecord(np.zeros(4), times=TIMES),
     )
-    found = eigenvalues(record.system, [[-2.0]], int(record.axis.steps[-1]), record.inputs)
-    starts, lengths = (part[:-1] for part in record.axis.rows())
+    found = eigenvalues(record.system, [[-2.0]], int(record.axes[0].steps[-1]), record.inputs)
+    starts, lengths = (part[:-1] for part in record.axes[0].rows())
     last = starts + lengths * (substeps - 1) / substeps  # where the last substep begins
     slopes = 1 - 2.0 * last * lengths / substeps
     assert found.real.min() == pytest.approx(slopes.min(), rel=1e-12)

@@ -24,7 +24,7 @@ from pymc_statespace_filters.system.own_units import (
     moments_in_own_units,
     moments_of_members,
 )
-from pymc_statespace_filters.system.record import checked_record
+from pymc_statespace_filters.system.record import read_record
 from tests.systems import DOUBLE_WELL_SYSTEM, PAIR, PAIR_DATA, STEPS, log_likelihoods
 
 pytestmark = pytest.mark.usefixtures("interpreted")
@@ -101,11 +101,11 @@ def test_a_drifting_gain_of_a_linear_system_has_the_exact_likelihood(case, at):
         {"inputs": PUSH, "input_times": np.arange(20) * DT} if at != "grid" else {"inputs": PUSH}
     )
     found = psf.log_likelihood(system, psf.EKF(), PARAMS | params, DATA, **record)
-    checked = checked_record(system, GivenRecord(DATA, **record))
-    starts, lengths = checked.axis.rows()
+    checked = read_record(system, GivenRecord(DATA, **record))
+    starts, lengths = checked.axes[0].rows()
     rows = checked.arguments[2]
     expected = kalman(
-        lengths[:-1], starts[:-1], list(checked.axis.steps), rows[:, 0],
+        lengths[:-1], starts[:-1], list(checked.axes[0].steps), rows[:, 0],
         params["gain_strength"], params.get("gain_rate", 0.0),
         process.every if process.every > 1 else None,
     )  # fmt: skip
@@ -273,7 +273,7 @@ def test_lengths_of_a_step_are_compared_with_one_path_of_the_noise():
 
 def test_the_column_of_a_held_parameter_moves_once_in_a_divided_step():
     system = psf.drifting(pushed(), gain=psf.RandomWalk(every=2))
-    rows = checked_record(system, GivenRecord(DATA, steps=GRID, inputs=PUSH)).arguments[2]
+    rows = read_record(system, GivenRecord(DATA, steps=GRID, inputs=PUSH)).arguments[2]
     np.testing.assert_array_equal(rows[:, 1], np.arange(20) % 2)
     finer = divided(system, rows, 3)
     np.testing.assert_array_equal(np.flatnonzero(finer[:, 1]), np.arange(5, 60, 6))

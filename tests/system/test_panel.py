@@ -6,9 +6,9 @@ import pytest
 
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.given_record import GivenRecord
-from pymc_statespace_filters.system.panel import checked_panel
 from pymc_statespace_filters.system.panel_records import FIRST_INPUT, RECORD, STEP, records_of
 from pymc_statespace_filters.system.parameters import panel_parameters
+from pymc_statespace_filters.system.record import read_record
 from tests.systems import FORCE, FORCED, PAIR, forced
 
 LABELS = ["b", "b", "a", "c", "c"]
@@ -18,7 +18,7 @@ DATA = np.arange(5.0)
 
 def panel_of(labels=LABELS, observed=DATA, steps=STEPS, inputs=FORCE, system=FORCED, **options):
     options = {"times": None, "t0": 0.0} | options
-    return checked_panel(system, GivenRecord(observed, labels, steps, inputs=inputs, **options))
+    return read_record(system, GivenRecord(observed, labels, steps, inputs=inputs, **options))
 
 
 def test_records_are_in_the_order_of_their_rows():
@@ -47,21 +47,21 @@ def test_the_code_of_a_text_does_not_depend_on_other_labels():
 
 def test_rows_hold_code_step_and_first_row_of_inputs():
     table = panel_of(inputs={"a": FORCE[:1], "b": FORCE[:3], "c": FORCE[:5]})
-    np.testing.assert_array_equal(table.rows[:, RECORD], table.records.codes[[0, 0, 1, 2, 2]])
-    np.testing.assert_array_equal(table.rows[:, STEP], STEPS)
-    np.testing.assert_array_equal(table.rows[:, FIRST_INPUT], [0, 0, 3, 4, 4])
+    np.testing.assert_array_equal(table.steps[:, RECORD], table.records.codes[[0, 0, 1, 2, 2]])
+    np.testing.assert_array_equal(table.steps[:, STEP], STEPS)
+    np.testing.assert_array_equal(table.steps[:, FIRST_INPUT], [0, 0, 3, 4, 4])
     np.testing.assert_array_equal(table.inputs[:, 0], [*FORCE[:3], *FORCE[:1], *FORCE[:5]])
 
 
 def test_shared_inputs_are_not_copied_to_every_record():
     table = panel_of()
     assert table.inputs.shape == (6, 1)
-    assert (table.rows[:, FIRST_INPUT] == 0).all()
+    assert (table.steps[:, FIRST_INPUT] == 0).all()
 
 
 def test_times_are_those_of_each_record():
     table = panel_of(steps=None, times=STEPS + 2.0, t0=2.0)
-    np.testing.assert_array_equal(table.rows[:, STEP], STEPS)
+    np.testing.assert_array_equal(table.steps[:, STEP], STEPS)
 
 
 def test_accumulators_are_reset_at_the_observations_of_their_own_record():
@@ -76,7 +76,7 @@ def test_accumulators_are_reset_at_the_observations_of_their_own_record():
         states=["level", "total"],
     )
     table = panel_of(system=system)
-    resets = [table.inputs[first:, -1] for first in table.rows[[0, 2, 3], FIRST_INPUT]]
+    resets = [table.inputs[first:, -1] for first in table.steps[[0, 2, 3], FIRST_INPUT]]
     for column, steps in zip(resets, ([0, 3], [1], [0, 2]), strict=True):
         assert np.flatnonzero(column[:6]).tolist() == steps
 

@@ -9,7 +9,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.system.clock import clock_and_start
 from pymc_statespace_filters.system.given_record import GivenRecord
-from pymc_statespace_filters.system.record import checked_record
+from pymc_statespace_filters.system.record import read_record
 from pymc_statespace_filters.system.time_axis import divided_axis
 
 THETA = {"a": 0.7, "s": 0.5}
@@ -62,8 +62,8 @@ def test_a_gap_of_whole_steps_has_so_many():
 
 
 def test_a_record_on_the_grid_has_the_system_and_the_arrays_of_its_steps():
-    by_times = checked_record(EXACT, GivenRecord(DATA[:3], times=[0.5, 1.0 + 1e-8, 3.0]))
-    by_steps = checked_record(EXACT, GivenRecord(DATA[:3], steps=[1, 2, 6]))
+    by_times = read_record(EXACT, GivenRecord(DATA[:3], times=[0.5, 1.0 + 1e-8, 3.0]))
+    by_steps = read_record(EXACT, GivenRecord(DATA[:3], steps=[1, 2, 6]))
     assert by_times.system is EXACT
     for one, other in zip(by_times.arguments, by_steps.arguments, strict=True):
         np.testing.assert_array_equal(one, other)
@@ -157,7 +157,7 @@ def test_an_exact_step_of_any_length_is_that_of_a_grid(stiff):
         for dt in (0.25, 0.3)
     ]
     times = 0.25 * np.array([1, 2, 5, 9])
-    records = [checked_record(system, GivenRecord(DATA[:4], times=times)) for system in systems]
+    records = [read_record(system, GivenRecord(DATA[:4], times=times)) for system in systems]
     assert [record.system.is_at_any_times for record in records] == [False, True]
     terms = [
         psf.log_likelihood(system, psf.EKF(), {"a": 2.0}, DATA[:4], times=times)
@@ -332,11 +332,11 @@ DAYS = (DATES - DATES[0]) / np.timedelta64(1, "D")
     ids=["array", "index", "series", "zone", "xarray", "datetimes"],
 )
 def test_dates_have_the_bits_of_equal_numbers(dates):
-    placed = checked_record(EXACT, GivenRecord(DATA, times=dates, unit="D"))
-    expected = checked_record(EXACT, GivenRecord(DATA, times=DAYS))
+    placed = read_record(EXACT, GivenRecord(DATA, times=dates, unit="D"))
+    expected = read_record(EXACT, GivenRecord(DATA, times=DAYS))
     for one, other in zip(placed.arguments, expected.arguments, strict=True):
         np.testing.assert_array_equal(one, other)
-    np.testing.assert_array_equal(placed.times(placed.axis.steps), DATES)
+    np.testing.assert_array_equal(placed.times([placed.axes[0].steps]), DATES)
 
 
 def test_a_series_brings_its_dates():
@@ -401,43 +401,43 @@ def test_records_of_a_panel_start_at_their_own_first_dates():
 )
 def test_dates_that_are_refused(settings, message):
     with pytest.raises(ModelError, match=message):
-        checked_record(EXACT, GivenRecord(DATA, **settings))
+        read_record(EXACT, GivenRecord(DATA, **settings))
 
 
 def test_dates_of_the_data_are_those_of_the_times():
     series = pd.Series(DATA, index=pd.DatetimeIndex(DATES))
-    expected = checked_record(EXACT, GivenRecord(series, unit="D")).observed
-    found = checked_record(EXACT, GivenRecord(series, times=list(DATES), unit="D"))
+    expected = read_record(EXACT, GivenRecord(series, unit="D")).observed
+    found = read_record(EXACT, GivenRecord(series, times=list(DATES), unit="D"))
     np.testing.assert_array_equal(found.observed, expected)
     other = pd.DatetimeIndex(DATES) + pd.Timedelta("1h")
     for observed, times in ((series, other), (series[::-1], DATES)):
         with pytest.raises(
             ModelError, match=r"times must be the dates of observed, got times.0. ="
         ):
-            checked_record(EXACT, GivenRecord(observed, times=times, unit="D"))
+            read_record(EXACT, GivenRecord(observed, times=times, unit="D"))
     with pytest.raises(ModelError, match="the dates of observed must increase"):
-        checked_record(EXACT, GivenRecord(series[::-1], steps=np.arange(DATA.size)))
+        read_record(EXACT, GivenRecord(series[::-1], steps=np.arange(DATA.size)))
 
 
 def test_rows_of_tables_are_in_one_order():
     table = pd.DataFrame({"time": TIMES[::-1], "y": DATA[::-1]})
     in_order = table.sort_values("time")
-    found = checked_record(EXACT, GivenRecord(in_order["y"], times=in_order["time"]))
+    found = read_record(EXACT, GivenRecord(in_order["y"], times=in_order["time"]))
     np.testing.assert_array_equal(found.observed[:, 0], DATA)
     with pytest.raises(ModelError, match="times must have its rows in the order of observed"):
-        checked_record(EXACT, GivenRecord(table["y"], times=in_order["time"]))
-    checked_record(EXACT, GivenRecord(table["y"].to_numpy(), times=in_order["time"]))
+        read_record(EXACT, GivenRecord(table["y"], times=in_order["time"]))
+    read_record(EXACT, GivenRecord(table["y"].to_numpy(), times=in_order["time"]))
 
 
 def test_an_index_without_dates_is_named():
     for index in (DATES.astype(str), None, pd.period_range("2020", periods=DATA.size, freq="M")):
         with pytest.raises(ModelError, match=r"brings no dates.*pd.to_datetime.*got the index"):
-            checked_record(EXACT, GivenRecord(pd.Series(DATA, index=index)))
+            read_record(EXACT, GivenRecord(pd.Series(DATA, index=index)))
 
 
 def test_missing_values_of_pandas_are_missing():
     series = pd.Series([1, None, 3], dtype="Int64")
-    record = checked_record(EXACT, GivenRecord(series, steps=[0, 1, 2]))
+    record = read_record(EXACT, GivenRecord(series, steps=[0, 1, 2]))
     np.testing.assert_array_equal(record.observed[:, 0], [1.0, np.nan, 3.0])
 
 
