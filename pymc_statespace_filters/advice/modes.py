@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 from pymc.model import Model
 
 from ..checks.coverage import ALL_MODES
-from ..pymc_model.density import ConstrainedValues, ModelDensity
+from ..pymc_model.at_points import ConstrainedValues
+from ..pymc_model.density import ModelDensity
 from ..sampling.output.facts import SeparateModes
 from ..sampling.starts.modes import is_reordered
 from ..sampling.target.variables import RaveledVariables

@@ -11,7 +11,8 @@ from pytensor.graph.traversal import ancestors
 
 from ..errors import ModelError
 from ..filters.protocol import Filter, ResumableFilter
-from ..pymc_model.filter_rows import FilterRows, ParametersAtPoints, Record
+from ..pymc_model.at_points import AtPoints
+from ..pymc_model.filter_rows import FilterRows, Record
 from ..pymc_model.inspection import resized
 from ..pymc_model.prior import ModelPrior
 from ..pymc_model.state_space_variable import (
@@ -82,9 +83,13 @@ class ObservedRows:
         return ModelPrior(self.model)
 
     @cached_property
-    def parameters(self) -> ParametersAtPoints:
-        """The parameters of the system at points."""
-        return ParametersAtPoints(self.model, self.variable.theta)
+    def _theta(self) -> AtPoints:
+        return AtPoints(self.model, [self.variable.theta])
+
+    def parameters(self, x: Array) -> Array:
+        """The parameters of the system (m, n_theta) at points x (m, k)."""
+        (theta,) = self._theta(x)
+        return np.ascontiguousarray(theta, dtype=np.float64)
 
     @cached_property
     def _run(self) -> FilterRows:

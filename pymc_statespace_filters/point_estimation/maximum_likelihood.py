@@ -14,7 +14,7 @@ from pymc.model import Model
 from ..errors import ModelError
 from ..evidence.estimators.newton import BatchFunction, WithGradient
 from ..progress import row_progress
-from ..pymc_model.density import ConstrainedValues
+from ..pymc_model.at_points import ConstrainedValues
 from ..pymc_model.elements import labels_of
 from ..pymc_model.inspection import given_model
 from ..pymc_model.prior import ModelFactors

@@ -67,26 +67,6 @@ def compile_raveled(
     return function, start
 
 
-class ConstrainedValues:
-    """Variables of a model as a function of its unconstrained vector.
-
-    ``variables`` are by default the free ones, in the order of the vector; ``names`` are theirs.
-    """
-
-    def __init__(self, model: pm.Model, variables: Sequence[TensorVariable] | None = None) -> None:
-        values = [model.rvs_to_values[rv] for rv in model.free_RVs]
-        chosen = model.free_RVs if variables is None else variables
-        outputs = model.replace_rvs_by_values(chosen)
-        # Machine code would take seconds to compile.
-        mode = "FAST_COMPILE"
-        self._function, _ = compile_raveled(model.initial_point(), outputs, values, mode=mode)
-        self.names = [variable.name for variable in chosen]
-
-    def __call__(self, x: Array) -> dict[str, np.ndarray]:
-        """Values by name at the unconstrained point x (k,)."""
-        return dict(zip(self.names, map(np.asarray, self._function(x)), strict=True))
-
-
 def check_free_variables(model: pm.Model) -> None:
     """Raise unless a model has free variables, all of them continuous, and none without data."""
     check_observed(model)

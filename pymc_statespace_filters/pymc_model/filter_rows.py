@@ -9,13 +9,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import pymc as pm
 from numpy.typing import NDArray
-from pymc.pytensorf import compile as compile_pymc
-from pytensor.graph.basic import Variable
 
 from ..compiler.lowering.compiled_system import compile_system
-from ..compiler.native.rows import at_points
 from ..filters.protocol import BatchFilter, Filter, ResumableFilter, properties
 from ..filters.state_law import StateLaw
 from ..ops.at_rows import at_rows
@@ -24,7 +20,6 @@ from ..ops.states import GoingOn, ResumableRun
 from ..parallel.shared_rows import evaluated_rows
 from ..parallel.threads import Pieces
 from ..system.model import StateSpaceModel
-from .elements import places_in_vector
 
 _PIECE_SECONDS = 0.02  # of one call of machine code, for whose end an interrupt waits
 _AT_ONCE = 8  # points, at least, of one call
@@ -47,25 +42,6 @@ class Record(NamedTuple):
     def first(self, n_rows: int) -> "Record":
         """The record that ends with the last of some rows."""
         return self.rows(0, n_rows)._replace(inputs=self.inputs[: self.steps[n_rows - 1]])
-
-
-class ParametersAtPoints:
-    """The parameters of a variable as a function of points of the unconstrained space."""
-
-    def __init__(self, model: pm.Model, theta: Variable) -> None:
-        values = [model.rvs_to_values[rv] for rv in model.free_RVs]
-        self._places = places_in_vector(model).values()
-        (graph,) = model.replace_rvs_by_values([theta])
-        points, (theta_at,) = at_points(values, [graph])
-        # Machine code would take seconds to compile; NumPy takes all points in one call.
-        self._function = compile_pymc(
-            points, theta_at, mode="FAST_COMPILE", on_unused_input="ignore", trust_input=True
-        )
-
-    def __call__(self, x: Array) -> Array:
-        """Parameters (m, n_theta) at points (m, k)."""
-        points = [x[:, at] for at in self._places]
-        return np.ascontiguousarray(self._function(*points), dtype=np.float64)
 
 
 class FilterRows:

@@ -20,7 +20,7 @@ from ..system.input_columns import divided, with_resets
 from ..system.integrators.substeps import CoupledNoise
 from ..system.model import StateSpaceModel
 from ..system.panel_records import FIRST_INPUT, RECORD, STEP
-from .density import compile_raveled
+from .at_points import AtPoints
 from .inspection import likelihood_nodes
 
 MAX_STEPS = 500
@@ -153,14 +153,11 @@ def _along_paths(
     nodes = [n for n in likelihood_nodes([model.logp()]) if n.op.system.integrator is not None]
     if not nodes:
         return None
-    values = [model.rvs_to_values[rv] for rv in model.free_RVs]
     # theta, steps, inputs and t0, but not data and seed.
-    needed = [node.inputs[i] for node in nodes for i in (0, 1, 3, 4)]
-    record, _ = compile_raveled(model.initial_point(), needed, values, mode="FAST_COMPILE")
+    records = AtPoints(model, [node.inputs[i] for node in nodes for i in (0, 1, 3, 4)])
 
     def along(x: Array) -> NDArray[Any]:
-        columns = [np.stack(column) for column in zip(*map(record, x), strict=True)]
-        found = []
+        columns, found = records(x), []
         for i, node in enumerate(nodes):
             arguments = columns[4 * i : 4 * i + 4]
             if node.op.form == PANEL:

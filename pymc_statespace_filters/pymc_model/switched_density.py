@@ -21,7 +21,8 @@ from pytensor.graph.replace import clone_replace
 from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
-from .density import RowFunction, check_free_variables, compile_raveled
+from .at_points import AtPoints
+from .density import RowFunction, check_free_variables
 
 Array = NDArray[np.float64]
 Columns = NDArray[np.int64]
@@ -147,17 +148,12 @@ class SwitchedValues:
 
     def __init__(self, graphs: "_SwitchedGraphs", variables: Sequence[TensorVariable]) -> None:
         self.names = [variable.name for variable in variables]
-        start = {value.name: at for value, at in graphs.point.items()}
-        # Machine code would take seconds to compile.
-        self._function, _ = compile_raveled(
-            start, graphs.values_of(variables), list(graphs.point), mode="FAST_COMPILE"
-        )
+        self._at_points = AtPoints(graphs.model, graphs.values_of(variables), graphs.point)
 
     def __call__(self, x: Array, is_on: NDArray[np.bool_]) -> dict[str, np.ndarray]:
         """Values by name, (m, ...), at points x (m, k) with switches (m, K)."""
-        rows = np.concatenate([x, is_on], axis=1)
-        found = zip(*(self._function(row) for row in rows), strict=True)
-        return dict(zip(self.names, map(np.stack, found), strict=True))
+        found = self._at_points(np.concatenate([x, is_on], axis=1))
+        return dict(zip(self.names, found, strict=True))
 
 
 class _SwitchedGraphs:
@@ -176,7 +172,7 @@ class _SwitchedGraphs:
             for rv in model.free_RVs
             if (self._number[rv] < len(switches)).any()
         }
-        self._model = model
+        self.model = model
         self._settings: dict[str, Any] = {
             "rvs_to_values": model.rvs_to_values | self._symbols,
             "rvs_to_transforms": model.rvs_to_transforms | dict.fromkeys(self._symbols),
@@ -213,7 +209,7 @@ class _SwitchedGraphs:
         """What the symbols stand for; it may contain those of variables before them."""
         found: dict[Variable, Variable] = {}
         for rv, symbol in self._symbols.items():
-            value, transform = self._model.rvs_to_values[rv], self._model.rvs_to_transforms[rv]
+            value, transform = self.model.rvs_to_values[rv], self.model.rvs_to_transforms[rv]
             if transform is not None:
                 (value,) = replace_rvs_by_values(
                     [transform.backward(value, *rv.owner.inputs)], **self._settings
@@ -231,7 +227,7 @@ class _SwitchedGraphs:
 
     def _own_term(self, rv: TensorVariable, term: TensorVariable) -> TensorVariable:
         """The log-density of a free variable given others, with its Jacobian; zero where held."""
-        is_elementwise = _is_elementwise(rv, self._model)
+        is_elementwise = _is_elementwise(rv, self.model)
         if rv not in self._symbols:
             return term if is_elementwise else term.sum()
         if not is_elementwise:
@@ -241,9 +237,9 @@ class _SwitchedGraphs:
                 f"({type(rv.owner.op).__name__}): give each of them a variable or a prior of its "
                 "own"
             )
-        transform = self._model.rvs_to_transforms[rv]
+        transform = self.model.rvs_to_transforms[rv]
         if transform is not None:
-            value = self._model.rvs_to_values[rv]
+            value = self.model.rvs_to_values[rv]
             (jacobian,) = replace_rvs_by_values(
                 [transform.log_jac_det(value, *rv.owner.inputs)], **self._settings
             )

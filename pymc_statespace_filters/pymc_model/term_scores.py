@@ -12,15 +12,14 @@ from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import ancestors
 
 from ..compiler.lowering.structure import parameters_after_start
-from ..compiler.native.rows import interpreted_at_points
 from ..errors import ModelError
 from ..filters.signatures import PANEL
 from ..filters.written import short_form
 from ..ops.base import evaluator
 from ..ops.likelihood import LogLikelihood
 from ..system.panel_records import FIRST_INPUT, N_COLUMNS, RECORD, STEP, records_of
+from .at_points import AtPoints
 from .density import RowFunction, check_free_variables
-from .elements import places_in_vector
 from .inspection import scored_rows, state_space_nodes
 from .random_variable import draw_in_python
 
@@ -71,9 +70,8 @@ class ScoredVariable:
         self.name, self.system, self.filter = name, node.op.system, node.op.filter
         _check_filter(name, self.filter)
         self.clock, self._op, self._scored = node.op.clock, node.op, scored_rows(node)
-        theta, *record = model.replace_rvs_by_values(list(node.inputs[-5:-1]))
-        self._values = [model.rvs_to_values[rv] for rv in model.free_RVs]
-        _check_record(name, record, self._values)
+        record = model.replace_rvs_by_values(list(node.inputs[-4:-1]))
+        _check_record(name, record, model.value_vars)
         table, self._inputs, self.t0 = (graph.eval(mode="FAST_COMPILE") for graph in record)
         self.is_panel = table.ndim == 2
         self._arguments = table
@@ -83,8 +81,7 @@ class ScoredVariable:
         observed = model.rvs_to_values[node.outputs[1]]
         self.observed = np.asarray(observed.eval(mode="FAST_COMPILE"), dtype=np.float64)
         self._evaluate = evaluator(LogLikelihood(self.system, self.filter, PANEL))
-        self._theta = interpreted_at_points(self._values, theta)
-        self._places = places_in_vector(model).values()
+        self._theta = AtPoints(model, [node.inputs[-5]])
         others = [v for v in [*model.basic_RVs, *model.potentials] if v.name != name]
         self._others = RowFunction(model, model.logp(vars=others))
 
@@ -120,7 +117,7 @@ class ScoredVariable:
 
     def theta(self, x: Array) -> Array:
         """The parameters (m, G, k) of every record at points x (m, k_x)."""
-        found = self._theta(*(x[:, at] for at in self._places))
+        (found,) = self._theta(x)
         return found if self.is_panel else found[:, None]
 
     def other_density(self, x: Array) -> Array:

@@ -12,7 +12,7 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
-from ...pymc_model.density import ConstrainedValues
+from ...pymc_model.at_points import ConstrainedValues
 from ...pymc_model.elements import element_names, places_in_vector
 from . import ALL_MODES
 from .check import MissedTail, missed_tails

@@ -9,15 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 import pymc as pm
-import pytensor
 import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
-from ...compiler.native.rows import at_points
 from ...errors import ModelError
-from ...pymc_model.elements import places_in_vector
+from ...pymc_model.at_points import AtPoints
 from ...pymc_model.ends_of_support import ends_of_support
 from ...pymc_model.inspection import parameter_graphs, state_space_nodes
 from ...pymc_model.prior import is_improper
@@ -102,20 +100,13 @@ class StrengthsAtPoints:
         ends = [_ends(rv, model) for rv in chosen]
         self._largest = np.concatenate([largest for largest, _ in ends])
         self._is_signed = np.concatenate([is_signed for _, is_signed in ends])
-        values = [model.rvs_to_values[rv] for rv in model.free_RVs]
-        self._places = places_in_vector(model).values()
         scalars = pt.concatenate([pt.flatten(rv) for rv in chosen])
         jacobian = pt.sum(pt.stack([_log_jacobian(rv, model) for rv in chosen]))
-        graphs = model.replace_rvs_by_values([scalars, jacobian])
-        points, at_all = at_points(values, graphs)
-        # One call handles all draws, which is not worth machine code.
-        self._function = pytensor.function(
-            points, at_all, mode="FAST_COMPILE", on_unused_input="ignore"
-        )
+        self._at_points = AtPoints(model, [scalars, jacobian])
 
     def __call__(self, x: Array) -> Strengths:
         """At points x (n, k)."""
-        scalars, log_jacobian = self._function(*(x[:, at] for at in self._places))
+        scalars, log_jacobian = self._at_points(x)
         return Strengths(np.abs(scalars), log_jacobian, self._largest, self._is_signed)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from ...pymc_model.density import ConstrainedValues
+from ...pymc_model.at_points import ConstrainedValues
 from ..exact_density import ExactDensity
 from .correction import Correction
 
@@ -49,15 +49,14 @@ def reweighted_tree(
 def _points(draws: xr.Dataset, correction: Correction, model: pm.Model) -> xr.Dataset:
     """The model's variables at all points, along the dimension ``sample``."""
     evaluate = ConstrainedValues(model, [*model.free_RVs, *model.deterministics])
-    values = [evaluate(x) for x in correction.x[correction.pooled.n_draws :]]
+    values = evaluate(correction.x[correction.pooled.n_draws :])
     found = {}
     for name in evaluate.names:
         if name not in draws:
             continue
         array = draws[name].transpose("chain", "draw", ...)
         at_draws = array.values.reshape(-1, *array.shape[2:])
-        at_points = np.stack([one[name] for one in values])
-        found[name] = ("sample", *array.dims[2:]), np.concatenate([at_draws, at_points])
+        found[name] = ("sample", *array.dims[2:]), np.concatenate([at_draws, values[name]])
     kept = {dim for dims, _ in found.values() for dim in dims}
     coords = {name: one for name, one in draws.coords.items() if set(one.dims) <= kept}
     return xr.Dataset(found, coords=coords)

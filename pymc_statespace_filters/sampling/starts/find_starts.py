@@ -5,7 +5,7 @@ from pymc.model import Model
 
 from ...errors import ModelError
 from ...facts import tell
-from ...pymc_model.density import ConstrainedValues
+from ...pymc_model.at_points import ConstrainedValues
 from ...pymc_model.inspection import given_model
 from ...system.checks import check_count, check_flag, check_random_seed
 from ..output.facts import SeparateModes
