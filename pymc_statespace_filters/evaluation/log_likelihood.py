@@ -1,15 +1,15 @@
 """Log-likelihoods without PyMC: numbers in, numbers out."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..compiler.numerics.philox import seeds_of_records
 from ..errors import DataMismatchError, ModelError
-from ..filters.checks import check_system_and_filter, tell_of_choice
+from ..filters.checks import check_choice
 from ..filters.outcomes import COLLAPSED, NONE
 from ..filters.protocol import BatchFilter, Filter
 from ..filters.signatures import PANEL, POINTS
@@ -109,45 +109,37 @@ def log_likelihood(
     >>> terms.shape
     (2,)
     """
-    check_system_and_filter(system, filter)
-    tell_of_choice(system, filter)
+    check_choice(system, filter)
     given = GivenRecord(observed, panel, steps, times, inputs, t0, unit, input_times, inputs_at)
     n_threads, seeds = check_count("cores", cores, 1), check_seed("seed", seed)
     record = read_record(system, given)
     check_exact_rows(record)
-    if record.is_panel:
-        if comm is not None:
-            raise ModelError("comm must be None for a panel: every rank evaluates all records")
-        return _of_panel(record, filter, params, seeds, n_threads)
-    if n_threads > 1:
+    if record.is_panel and comm is not None:
+        raise ModelError("comm must be None for a panel: every rank evaluates all records")
+    if n_threads > 1 and not record.is_panel:
         raise ModelError(f"cores must be 1 without a panel, whose records it divides, got {cores}")
-    theta = flat_parameters(system, params)
-    try:
-        shape = np.broadcast_shapes(theta.shape[:-1], seeds.shape)
-    except ValueError:
-        raise ModelError(
-            f"seed of shape {seeds.shape} does not broadcast with parameters "
-            f"of shape {theta.shape[:-1]}"
-        ) from None
-    theta = np.broadcast_to(theta, (*shape, theta.shape[-1]))
-    seeds = np.broadcast_to(seeds, shape)
-    points = np.ascontiguousarray(theta).reshape(seeds.size, theta.shape[-1])
     with communicator_of(comm) as ranks:
-        if ranks.size > 1:
-            _check_agreement(ranks, filter, (points, *record.arguments, seeds))
-        terms, health = _at_points(record, filter, points, seeds.ravel(), ranks)
+        if record.is_panel:
+            found = _of_panel(record, filter, params, seeds, n_threads)
+        else:
+            found = _at_points(record, filter, params, seeds, ranks)
         if ranks.rank == 0:
-            flat = seeds.ravel()
-            tell_of_health(
-                record.system, filter, health, lambda i: (points[i], *record.arguments, flat[i])
-            )
-    return terms.reshape(*shape, record.steps.size)
+            tell_of_health(record.system, filter, found.health, found.arguments_of, record.labels)
+    return found.terms
+
+
+class _Found(NamedTuple):
+    """Terms, health (n, 3) of all evaluations, and the arguments of each, see `Health`."""
+
+    terms: np.ndarray
+    health: np.ndarray
+    arguments_of: Callable[[int], tuple]
 
 
 def _of_panel(
     record: Record, filter: Filter, params: Any, seed: np.ndarray, n_threads: int
-) -> np.ndarray:
-    """Terms of all records, which threads share; if some fail, each is repeated to say which."""
+) -> _Found:
+    """All records, which threads share; if some fail, each is repeated to say which."""
     if seed.ndim:
         raise ModelError(f"seed must be one number for a panel, got shape {seed.shape}")
     system, records = record.system, record.records
@@ -164,15 +156,50 @@ def _of_panel(
     if n_parts > 1:
         part(0, 0)  # compiles, before there are threads
     with ThreadPoolExecutor(n_parts) as pool:
-        found = list(pool.map(part, ends[:-1], ends[1:]))
-    if any(health[1] != NONE or health[0] < COLLAPSED for _, health in found):
-        seeds = seeds_of_records(seed, records.codes)
-        each = zip(theta, record.each(), seeds, strict=True)
-        arguments = [(own, *rows, own_seed) for own, rows, own_seed in each]
-        repeated = evaluator(LogLikelihood(system, filter))
-        health = np.array([repeated(*one)[1] for one in arguments])
-        tell_of_health(system, filter, health, lambda g: arguments[g], labels=record.labels)
-    return np.concatenate([terms for terms, _ in found])
+        terms, health = zip(*pool.map(part, ends[:-1], ends[1:]), strict=True)
+    seeds = seeds_of_records(seed, records.codes)
+    each = zip(theta, record.each(), seeds, strict=True)
+    arguments = [(own, *rows, own_seed) for own, rows, own_seed in each]
+    if any(one[1] != NONE or one[0] < COLLAPSED for one in health):
+        evaluate_alone = evaluator(LogLikelihood(system, filter))
+        health = tuple(evaluate_alone(*one)[1] for one in arguments)
+    return _Found(np.concatenate(terms), np.array(health), lambda g: arguments[g])
+
+
+def _at_points(
+    record: Record, filter: Filter, params: Any, seeds: np.ndarray, ranks: Communicator
+) -> _Found:
+    """A record at all points, side by side if the filter can, else one by one."""
+    system, arguments = record.system, record.arguments
+    theta = flat_parameters(system, params)
+    try:
+        shape = np.broadcast_shapes(theta.shape[:-1], seeds.shape)
+    except ValueError:
+        raise ModelError(
+            f"seed of shape {seeds.shape} does not broadcast with parameters "
+            f"of shape {theta.shape[:-1]}"
+        ) from None
+    seeds = np.broadcast_to(seeds, shape).ravel()
+    points = np.ascontiguousarray(np.broadcast_to(theta, (*shape, theta.shape[-1])))
+    points = points.reshape(seeds.size, theta.shape[-1])
+    check_ranks(filter, ranks.size)
+    if ranks.size > 1:
+        _check_agreement(ranks, filter, (points, *arguments, seeds))
+    if len(points) > 1 and isinstance(filter, BatchFilter):
+        # A filter with batches is deterministic: any seed will do.
+        evaluate = evaluator(LogLikelihood(system, filter, POINTS))
+        terms, health = evaluate(points, *arguments, seeds[0])
+    else:
+        evaluate = distributed_evaluator(system, filter, ranks)
+        terms = np.empty((len(points), record.steps.size))
+        health = np.empty((len(points), HEALTH_SIZE))
+        for i, point in enumerate(points):
+            terms[i], health[i] = evaluate(point, *arguments, np.asarray(seeds[i]))
+    return _Found(
+        terms.reshape(*shape, record.steps.size),
+        health,
+        lambda i: (points[i], *arguments, seeds[i]),
+    )
 
 
 def _check_agreement(ranks: Communicator, filter: Filter, arrays: Sequence[np.ndarray]) -> None:
@@ -187,20 +214,3 @@ def _check_agreement(ranks: Communicator, filter: Filter, arrays: Sequence[np.nd
                 f"all ranks must make the same call, got other parameters, seeds, data or another "
                 f"filter on rank {rank} of {ranks.size} than on rank 0"
             )
-
-
-def _at_points(
-    record: Record, filter: Filter, points: np.ndarray, seeds: np.ndarray, ranks: Communicator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Terms and health of every point: side by side if the filter can, else one by one."""
-    system, arguments = record.system, record.arguments
-    check_ranks(filter, ranks.size)
-    if len(points) > 1 and isinstance(filter, BatchFilter):
-        # A filter with batches is deterministic: any seed will do.
-        return evaluator(LogLikelihood(system, filter, POINTS))(points, *arguments, seeds[0])
-    evaluate = distributed_evaluator(system, filter, ranks)
-    terms = np.empty((len(points), record.steps.size))
-    health = np.empty((len(points), HEALTH_SIZE))
-    for i, point in enumerate(points):
-        terms[i], health[i] = evaluate(point, *arguments, np.asarray(seeds[i]))
-    return terms, health

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ModelError
-from ..filters.checks import check_system_and_filter, tell_of_choice
+from ..filters.checks import check_choice
 from ..filters.outcomes import NONE, Failure
 from ..filters.protocol import Filter, ResumableFilter
 from ..system.checks import check_finite, check_random_seed
@@ -293,8 +293,7 @@ def online(
     >>> same[0].log_likelihood == same[1].log_likelihood
     True
     """
-    check_system_and_filter(system, filter)
-    tell_of_choice(system, filter)
+    check_choice(system, filter)
     if not isinstance(filter, ResumableFilter):
         raise ModelError(
             f"{type(filter).__name__} leaves no state from which it could go on, as the filters of "

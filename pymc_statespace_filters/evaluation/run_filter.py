@@ -11,7 +11,7 @@ import xarray as xr
 
 from ..compiler.numerics.philox import seeds_of_records
 from ..errors import ModelError
-from ..filters.checks import check_system_and_filter, tell_of_choice
+from ..filters.checks import check_choice
 from ..filters.protocol import Filter, ResumableFilter, check_states_filter, properties
 from ..ops.base import evaluator
 from ..ops.states import FilterRun, ResumableRun, States
@@ -124,8 +124,7 @@ def run_filter(
     >>> run["particles"].sizes
     Frozen({'time': 2, 'particle': 500, 'state': 1})
     """
-    check_system_and_filter(system, filter)
-    tell_of_choice(system, filter)
+    check_choice(system, filter)
     check_at(at)
     noise = check_seed("seed", seed)
     if noise.ndim:

@@ -41,8 +41,8 @@ def takes(filter: Filter, system: System) -> bool:
     return True
 
 
-def check_system_and_filter(system: Any, filter: Any) -> None:
-    """Raise unless these are a system and a filter that can treat it."""
+def check_system_and_filter(system: Any, filter: Any) -> System:
+    """Raise unless these are a system and a filter that can treat it; the compiled system."""
     check_system(system)
     check_filter(filter)
     compiled = compile_system(system)
@@ -50,6 +50,7 @@ def check_system_and_filter(system: Any, filter: Any) -> None:
         filter.check(compiled)
     except ModelError as refusal:
         raise ModelError(f"{refusal}; {in_words(Refusal(compiled, filter))}") from None
+    return compiled
 
 
 def check_unbiased(system: Any, filter: Any) -> bool:
@@ -57,8 +58,7 @@ def check_unbiased(system: Any, filter: Any) -> bool:
 
     It is not if the density of an observation is itself an approximation.
     """
-    check_system_and_filter(system, filter)
-    compiled = compile_system(system)
+    compiled = check_system_and_filter(system, filter)
     if not is_unbiased(compiled, filter):
         raise ModelError(
             f"filter must be exact or unbiased for this system, got {short_form(filter)}, whose "
@@ -72,9 +72,9 @@ def is_unbiased(system: System, filter: Any) -> bool:
     return properties(filter).unbiased or filter.is_exact_for(system)
 
 
-def tell_of_choice(system: Any, filter: Any) -> None:
-    """Warn if a filter that can treat a system does so badly."""
-    compiled = compile_system(system)
+def check_choice(system: Any, filter: Any) -> None:
+    """Raise unless a filter can treat a system, and warn if it does so badly."""
+    compiled = check_system_and_filter(system, filter)
     repeats = filter.noisy and compiled.is_deterministic
     if compiled.jumping_equations or repeats or compiled.start_over_noise >= NO_DIGITS:
         tell(Choice(compiled, filter))

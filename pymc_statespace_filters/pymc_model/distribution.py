@@ -15,7 +15,7 @@ from ..compiler.lowering.compiled_system import compile_system
 from ..errors import ModelError
 from ..evaluation.exact_rows import check_exact_rows
 from ..facts import in_words
-from ..filters.checks import Refusal, check_system_and_filter, tell_of_choice
+from ..filters.checks import Refusal, check_choice
 from ..filters.protocol import Filter, properties
 from ..filters.written import short_form
 from ..system.checks import is_integer
@@ -172,8 +172,7 @@ class StateSpace(Continuous):
         check_names(system, own)
         values = dict(system.defaults) | _model_variables(system, model) | dict(own)
         system = system.with_known(known_elements(system, values))
-        check_system_and_filter(system, filter)
-        tell_of_choice(system, filter)
+        check_choice(system, filter)
         others = tuple(model.named_vars)
         full_name = model.name_for(name)
         _check_name(model, full_name, name, system)

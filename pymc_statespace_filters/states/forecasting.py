@@ -14,10 +14,10 @@ from ..evaluation.simulate import continuation
 from ..pymc_model.checked_model import checked_model
 from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.state_space_variable import observed_variables
-from ..system.checks import check_floats, check_random_seed, is_integer
+from ..system.checks import check_random_seed, is_integer
 from ..system.given_record import inputs_with_times, own_inputs
 from ..system.input_columns import inputs_of_user, n_input_rows, only_seen
-from ..system.labels import columns_in_order
+from ..system.labels import table_of
 from ..system.model import StateSpaceModel
 from ..system.own_units import in_own_units
 from ..system.placement import check_takes
@@ -227,8 +227,7 @@ def _after_past(given: Any, record: RecordAtDraws, axis: TimeAxis) -> Any:
     is_future = n_past > 0 and np.shape(given)[:1] == (n_rows - n_past,)
     if not is_future or len(past) > 1 or axis.starts is not None:
         return given
-    ahead = check_floats("inputs", columns_in_order("inputs", given, system.inputs, "inputs"), None)
-    ahead = ahead[:, None] if ahead.ndim == 1 else ahead
+    ahead = table_of("inputs", given, system.inputs, "inputs")
     if ahead.shape[1:] != (system.n_inputs,):
         raise inputs_of_other_shape(system, ahead.shape)
     return np.concatenate([past[0, :n_past], ahead])

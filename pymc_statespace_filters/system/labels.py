@@ -8,7 +8,7 @@ import pandas as pd
 import xarray as xr
 
 from ..errors import ModelError
-from .checks import shortened
+from .checks import check_floats, shortened
 
 
 def default_names(letter: str, n: int) -> list[str]:
@@ -35,6 +35,16 @@ def columns_in_order(name: str, value: Any, components: Sequence[str], role: str
             "taken by position"
         )
     return np.asarray(value)[:, positions]
+
+
+def table_of(
+    name: str, value: Any, components: Sequence[str], role: str, *, missing: bool = False
+) -> np.ndarray:
+    """Numbers with a column for each component, see `columns_in_order`; of one, also a vector."""
+    array = check_floats(
+        name, columns_in_order(name, value, components, role), None, missing=missing
+    )
+    return array[:, None] if array.ndim == 1 and len(components) == 1 else array
 
 
 def rows_in_order(name: str, value: Any, labels: Sequence[Any]) -> Any:

@@ -20,11 +20,11 @@ from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Variable
 
 from ..errors import ModelError
-from .checks import check_floats, shortened
+from .checks import shortened
 from .clock import Clock
 from .given_record import GivenRecord
 from .input_columns import n_input_rows, only_seen, warn_of_gaps_in_sums, with_columns
-from .labels import columns_in_order
+from .labels import table_of
 from .model import StateSpaceModel
 from .panel_records import ALONE, FIRST_INPUT, STEP, Records, records_of
 from .placement import Earlier
@@ -186,10 +186,7 @@ def check_system(system: Any) -> None:
 
 def check_observed(observed: Any, system: StateSpaceModel, n_observations: int) -> np.ndarray:
     """The data as (J, p); NaN marks what is missing."""
-    observed = columns_in_order("observed", observed, system.observables, "observables")
-    array = check_floats("observed", observed, None, missing=True)
-    if array.ndim == 1 and system.p == 1:
-        array = array[:, None]
+    array = table_of("observed", observed, system.observables, "observables", missing=True)
     if array.shape != (n_observations, system.p):
         raise ModelError(
             f"observed must have shape {(n_observations, system.p)} (observations x observables), "
@@ -265,10 +262,7 @@ def _check_inputs_of_user(inputs: Any, system: StateSpaceModel, axis: TimeAxis) 
             f"inputs must be None for a system without inputs, got {shortened(inputs)}; name them "
             f"in the system (StateSpaceModel(inputs=[...]))"
         )
-    inputs = columns_in_order("inputs", inputs, system.inputs, "inputs")
-    array = check_floats("inputs", inputs, None)
-    if array.ndim == 1 and system.n_inputs == 1:
-        array = array[:, None]
+    array = table_of("inputs", inputs, system.inputs, "inputs")
     if array.ndim != 2 or array.shape[1] != system.n_inputs:
         raise inputs_of_other_shape(system, np.shape(inputs))
     needed = n_input_rows(system, axis.steps)

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import ModelError
-from .checks import check_floats
 from .clock import Clock, times_of_data
-from .labels import columns_in_order
+from .labels import table_of
 from .model import StateSpaceModel
 from .steps import GRID_TOLERANCE
 from .time_axis import TimeAxis, check_increasing
@@ -94,9 +93,7 @@ def timed_inputs(
     check_inputs_at(inputs_at)
     times = clock.numbers("input_times", input_times, record)
     check_increasing("input_times", times, lambda time: clock.shown(time, record))
-    values = check_floats("inputs", columns_in_order("inputs", inputs, names, "inputs"), None)
-    if values.ndim == 1 and len(names) == 1:
-        values = values[:, None]
+    values = table_of("inputs", inputs, names, "inputs")
     if not names or values.shape != (times.size, len(names)):
         raise ModelError(
             f"inputs must have shape {(times.size, len(names))}, a row for each of input_times and "

@@ -14,7 +14,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.advice.refusals import alternatives
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.errors import FilterWarning
-from pymc_statespace_filters.filters.checks import tell_of_choice
+from pymc_statespace_filters.filters.checks import check_choice
 from pymc_statespace_filters.filters.outcomes import STATE_NOT_FINITE
 from pymc_statespace_filters.filters.signatures import POINTS
 from pymc_statespace_filters.ops.base import evaluator
@@ -333,9 +333,9 @@ def test_a_log_density_and_a_carried_state_are_taken():
 @pytest.mark.parametrize("filter", [psf.BootstrapPF(10), psf.EnKF(10)], ids=repr)
 def test_members_that_are_all_the_same_are_warned_of(filter):
     with pytest.warns(FilterWarning, match=r"all members are the same. Use EKF\(\)"):
-        tell_of_choice(KNOWN, filter)
-    tell_of_choice(UNKNOWN, filter)
-    tell_of_choice(KNOWN, psf.EKF())
+        check_choice(KNOWN, filter)
+    check_choice(UNKNOWN, filter)
+    check_choice(KNOWN, psf.EKF())
 
 
 def test_the_filter_for_equations_without_noise_is_the_ekf():
