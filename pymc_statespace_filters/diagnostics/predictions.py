@@ -1,5 +1,6 @@
 """The predictive distribution of every observation, mixed over the draws of the posterior."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -7,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr, logsumexp, ndtri_exp
 
 from ..pymc_model.observation_moments import Moments, moments_of_observations, moments_on_tape
-from ..pymc_model.state_space_variable import Evaluation, predictions_of, tape_of
+from ..pymc_model.state_space_variable import predictions_of, tape_of
 from ..states.record import Array, RecordAtDraws, States
 from ..statistics.pit import pit_of
 from .calibration import residual_limit
@@ -70,7 +71,7 @@ def laws_of(record: RecordAtDraws, before: States) -> Laws | None:
 
 
 def _linearised(
-    record: RecordAtDraws, taped: Evaluation, seeds: NDArray[np.int64]
+    record: RecordAtDraws, taped: Callable[..., list[Array]], seeds: NDArray[np.int64]
 ) -> tuple[Array, Array, Array]:
     """Terms (draws, J) and the moments of every observation before it is seen.
 

@@ -11,7 +11,7 @@ from pytensor.graph.traversal import ancestors
 
 from ..errors import ModelError
 from ..filters.protocol import Filter, ResumableFilter
-from ..pymc_model.at_points import AtPoints
+from ..pymc_model.at_points import GraphsAtPoints
 from ..pymc_model.filter_rows import FilterRows, Record
 from ..pymc_model.inspection import resized
 from ..pymc_model.prior import ModelPrior
@@ -83,8 +83,8 @@ class ObservedRows:
         return ModelPrior(self.model)
 
     @cached_property
-    def _theta(self) -> AtPoints:
-        return AtPoints(self.model, [self.variable.theta])
+    def _theta(self) -> GraphsAtPoints:
+        return GraphsAtPoints(self.model, [self.variable.theta])
 
     def parameters(self, x: Array) -> Array:
         """The parameters of the system (m, n_theta) at points x (m, k)."""

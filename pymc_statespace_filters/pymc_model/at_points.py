@@ -17,7 +17,7 @@ from ..compiler.native.rows import at_points
 Array = NDArray[np.float64]
 
 
-class AtPoints:
+class GraphsAtPoints:
     """Graphs of a model's variables at points.
 
     Those of its value variables if a ``point`` has a value of each, in the order of the vector.
@@ -59,7 +59,7 @@ class ConstrainedValues:
 
     def __init__(self, model: pm.Model, variables: Sequence[TensorVariable] | None = None) -> None:
         chosen = model.free_RVs if variables is None else variables
-        self._at_points, self.names = AtPoints(model, chosen), [v.name for v in chosen]
+        self._at_points, self.names = GraphsAtPoints(model, chosen), [v.name for v in chosen]
 
     def __call__(self, x: Array) -> dict[str, np.ndarray]:
         """Values by name (..., *shape) at points x (..., k)."""

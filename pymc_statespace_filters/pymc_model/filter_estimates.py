@@ -18,9 +18,9 @@ from ..filters.checks import check_system_and_filter
 from ..filters.outcomes import Failure
 from ..filters.protocol import Filter
 from ..filters.signatures import ONE_RECORD, PANEL
-from ..ops.at_rows import at_rows
+from ..ops.at_points import FilterAtPoints
 from ..ops.likelihood import LogLikelihood
-from .at_points import AtPoints
+from .at_points import GraphsAtPoints
 from .density import check_free_variables
 from .inspection import scored_rows, state_space_nodes
 
@@ -49,9 +49,9 @@ class VariableAtPoints:
         graphs = {"theta": theta, "steps": steps, "observed": data, "inputs": inputs, "t0": t0}
         free = set(model.free_RVs)
         self._varying = [n for n, graph in graphs.items() if free & set(ancestors([graph]))]
-        first = AtPoints(model, list(graphs.values()))(x[:1])
+        first = GraphsAtPoints(model, list(graphs.values()))(x[:1])
         self._constant = {n: value[0] for n, value in zip(graphs, first, strict=True)}
-        self._evaluate = AtPoints(model, [graphs[n] for n in self._varying])
+        self._evaluate = GraphsAtPoints(model, [graphs[n] for n in self._varying])
         self._form = PANEL if steps.type.ndim == 2 else ONE_RECORD
         self._scored = scored_rows(node)
         self._move(x)
@@ -126,7 +126,8 @@ class VariableAtPoints:
         varying = {n: value[chosen] for n, value in self._arguments.items()}
         constant = {n: value for n, value in self._constant.items() if n not in varying}
         operation = LogLikelihood(self.system, filter, self._form)
-        (found,) = at_rows(operation, [name], varying | {"seed": seeds.ravel()}, constant)
+        evaluate = FilterAtPoints(operation, [name])
+        (found,) = evaluate(varying | {"seed": seeds.ravel()}, constant)
         return found
 
 

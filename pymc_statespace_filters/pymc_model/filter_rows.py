@@ -5,7 +5,6 @@ Rows are evaluated at all points by machine code, in threads where that is worth
 side by side may differ from a point alone in the last bit.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,15 +13,10 @@ from numpy.typing import NDArray
 from ..compiler.lowering.compiled_system import compile_system
 from ..filters.protocol import BatchFilter, Filter, ResumableFilter, properties
 from ..filters.state_law import StateLaw
-from ..ops.at_rows import at_rows
-from ..ops.base import evaluator
+from ..ops.at_points import FilterAtPoints
+from ..ops.base import FilterOp
 from ..ops.states import GoingOn, ResumableRun
-from ..parallel.shared_rows import evaluated_rows
-from ..parallel.threads import Pieces
 from ..system.model import StateSpaceModel
-
-_PIECE_SECONDS = 0.02  # of one call of machine code, for whose end an interrupt waits
-_AT_ONCE = 8  # points, at least, of one call
 
 Array = NDArray[np.float64]
 
@@ -49,12 +43,12 @@ class FilterRows:
 
     def __init__(self, system: StateSpaceModel, filter: Filter) -> None:
         self.filter, self._system = filter, system
-        self._evaluate: _SideBySide | _OneByOne
-        if properties(filter).resumes_many:
+        self._together = properties(filter).resumes_many
+        operation: FilterOp = ResumableRun(system, filter)
+        if self._together:
             assert isinstance(filter, BatchFilter)
-            self._evaluate = _SideBySide(system, filter)
-        else:
-            self._evaluate = _OneByOne(system, filter)
+            operation = GoingOn(system, filter)
+        self._at_points = FilterAtPoints(operation, ["terms", "state"])
 
     def __call__(
         self,
@@ -98,49 +92,17 @@ class FilterRows:
         assert isinstance(self.filter, ResumableFilter)
         return self.filter.law_of_state(compile_system(self._system), states)
 
-
-class _SideBySide:
-    """All points in one call of machine code, or in pieces that share the threads."""
-
-    def __init__(self, system: StateSpaceModel, filter: BatchFilter) -> None:
-        self._op = GoingOn(system, filter)
-        self._function, self._pieces = evaluator(self._op), Pieces(_PIECE_SECONDS, _AT_ONCE)
-
-    def __call__(
+    def _evaluate(
         self, theta: Array, seeds: NDArray[np.int64], states: Array, record: Record
     ) -> tuple[Array, Array]:
-        def at(points: slice) -> Sequence[Array]:
-            return self._at(theta[points], states[points], record)
-
-        def evaluate(points: slice) -> list[Array]:
-            given = [theta[points], *record, states[points]]
-            return self._pieces(at, points, self._op.n_steps(given))
-
-        def empty(m: int) -> list[Array]:
-            nothing = self._at(theta[:0], states[:0], record)
-            return [np.empty((m, part.shape[1])) for part in nothing]
-
-        terms, after = evaluated_rows(evaluate, [theta, states], empty)
-        return terms, after
-
-    def _at(self, theta: Array, states: Array, record: Record) -> tuple[Array, Array]:
-        terms, _, after = self._function(theta, *record, states)
-        return terms, after
-
-
-class _OneByOne:
-    """One point after the other in each thread, each with its own noise."""
-
-    def __init__(self, system: StateSpaceModel, filter: Filter) -> None:
-        self._operation = ResumableRun(system, filter)
-
-    def __call__(
-        self, theta: Array, seeds: NDArray[np.int64], states: Array, record: Record
-    ) -> tuple[Array, Array]:
-        varying = {"theta": theta, "seed": seeds}
-        given = {**record._asdict(), "wanted": np.empty(0, np.int64)}
-        (varying if states.shape[1] else given)["state"] = (
-            states if states.shape[1] else np.empty(0)
-        )
-        terms, after = at_rows(self._operation, ["terms", "state"], varying, given)
+        varying: dict[str, np.ndarray] = {"theta": theta}
+        constant = record._asdict()
+        if not self._together:  # each point has its own noise, and a state has no first dimension
+            varying["seed"] = seeds
+            constant["wanted"] = np.empty(0, np.int64)
+        if self._together or states.shape[1]:
+            varying["state"] = states
+        else:
+            constant["state"] = np.empty(0)
+        terms, after = self._at_points(varying, constant)
         return terms, after

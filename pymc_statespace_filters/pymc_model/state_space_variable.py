@@ -1,9 +1,7 @@
 """The StateSpace variables of a model, as what evaluates their filters at draws sees them."""
 
-from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-import numpy as np
 import pymc as pm
 from pytensor.tensor.variable import TensorVariable
 
@@ -16,8 +14,7 @@ from ..filters.protocol import (
     StatesFilter,
     check_states_filter,
 )
-from ..ops.at_rows import at_rows
-from ..ops.base import FilterOp
+from ..ops.at_points import FilterAtPoints
 from ..ops.likelihood import LogLikelihood, TapedLogLikelihood
 from ..ops.states import Predictions, States, TermHealth
 from ..system.clock import Clock
@@ -84,51 +81,35 @@ def with_other_filter(variable: StateSpaceVariable, filter: Filter) -> StateSpac
     return variable._replace(filter=check_states_filter(filter))
 
 
-class Evaluation(NamedTuple):
-    """What a filter computes along one record, and which of the results are wanted."""
-
-    operation: FilterOp
-    results: tuple[str, ...]
-
-    def __call__(
-        self,
-        varying: Mapping[str, np.ndarray],
-        constant: Mapping[str, np.ndarray],
-        on_progress: Callable[[int], None],
-    ) -> list[np.ndarray]:
-        """The results for many values of the varying arguments, see `at_rows`."""
-        return at_rows(self.operation, self.results, varying, constant, on_progress)
-
-
-def states_of(variable: StateSpaceVariable, moment: str) -> Evaluation:
+def states_of(variable: StateSpaceVariable, moment: str) -> FilterAtPoints:
     """Mean, sd and a draw of the state at ``wanted`` steps, effective sample size and health."""
     results = ("mean", "sd", "drawn", "n_effective_wanted", "health")
     operation = States(variable.system, check_states_filter(variable.filter), moment)
-    return Evaluation(operation, results)
+    return FilterAtPoints(operation, results)
 
 
-def terms_of(variable: StateSpaceVariable) -> Evaluation:
+def terms_of(variable: StateSpaceVariable) -> FilterAtPoints:
     """The terms of a likelihood estimate."""
-    return Evaluation(LogLikelihood(variable.system, variable.filter), ("terms",))
+    return FilterAtPoints(LogLikelihood(variable.system, variable.filter), ("terms",))
 
 
-def term_health_of(variable: StateSpaceVariable) -> Evaluation:
+def term_health_of(variable: StateSpaceVariable) -> FilterAtPoints:
     """The effective number behind every term of a likelihood estimate, and health."""
-    return Evaluation(TermHealth(variable.system, variable.filter), ("n_effective", "health"))
+    return FilterAtPoints(TermHealth(variable.system, variable.filter), ("n_effective", "health"))
 
 
-def tape_of(variable: StateSpaceVariable) -> Evaluation | None:
+def tape_of(variable: StateSpaceVariable) -> FilterAtPoints | None:
     """Terms, and a tape of the moments of the state; None if the filter has no such tape."""
     filter = variable.filter
     has_tape = isinstance(filter, DifferentiableFilter) and filter.has_gradient
     if not has_tape or isinstance(filter, PredictionFilter):
         return None
-    return Evaluation(TapedLogLikelihood(variable.system, filter), ("terms", "tape"))
+    return FilterAtPoints(TapedLogLikelihood(variable.system, filter), ("terms", "tape"))
 
 
-def predictions_of(variable: StateSpaceVariable) -> Evaluation | None:
+def predictions_of(variable: StateSpaceVariable) -> FilterAtPoints | None:
     """The law of every observation before it is seen, see `PREDICTIONS`; None if unknown."""
     if not (isinstance(variable.filter, PredictionFilter) and variable.system.additive_noise):
         return None
     operation = Predictions(variable.system, variable.filter)
-    return Evaluation(operation, ("predicted", "predicted_cov", "log_below", "log_above"))
+    return FilterAtPoints(operation, ("predicted", "predicted_cov", "log_below", "log_above"))

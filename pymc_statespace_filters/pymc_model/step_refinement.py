@@ -20,7 +20,7 @@ from ..system.input_columns import divided, with_resets
 from ..system.integrators.substeps import CoupledNoise
 from ..system.model import StateSpaceModel
 from ..system.panel_records import FIRST_INPUT, RECORD, STEP
-from .at_points import AtPoints
+from .at_points import GraphsAtPoints
 from .inspection import likelihood_nodes
 
 MAX_STEPS = 500
@@ -154,7 +154,7 @@ def _along_paths(
     if not nodes:
         return None
     # theta, steps, inputs and t0, but not data and seed.
-    records = AtPoints(model, [node.inputs[i] for node in nodes for i in (0, 1, 3, 4)])
+    records = GraphsAtPoints(model, [node.inputs[i] for node in nodes for i in (0, 1, 3, 4)])
 
     def along(x: Array) -> NDArray[Any]:
         columns, found = records(x), []

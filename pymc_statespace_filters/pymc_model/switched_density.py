@@ -21,7 +21,7 @@ from pytensor.graph.replace import clone_replace
 from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
-from .at_points import AtPoints
+from .at_points import GraphsAtPoints
 from .density import RowFunction, check_free_variables
 
 Array = NDArray[np.float64]
@@ -148,7 +148,7 @@ class SwitchedValues:
 
     def __init__(self, graphs: "_SwitchedGraphs", variables: Sequence[TensorVariable]) -> None:
         self.names = [variable.name for variable in variables]
-        self._at_points = AtPoints(graphs.model, graphs.values_of(variables), graphs.point)
+        self._at_points = GraphsAtPoints(graphs.model, graphs.values_of(variables), graphs.point)
 
     def __call__(self, x: Array, is_on: NDArray[np.bool_]) -> dict[str, np.ndarray]:
         """Values by name, (m, ...), at points x (m, k) with switches (m, K)."""

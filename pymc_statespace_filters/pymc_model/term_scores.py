@@ -18,7 +18,7 @@ from ..filters.written import short_form
 from ..ops.base import evaluator
 from ..ops.likelihood import LogLikelihood
 from ..system.panel_records import FIRST_INPUT, N_COLUMNS, RECORD, STEP, records_of
-from .at_points import AtPoints
+from .at_points import GraphsAtPoints
 from .density import RowFunction, check_free_variables
 from .inspection import scored_rows, state_space_nodes
 from .random_variable import draw_in_python
@@ -81,7 +81,7 @@ class ScoredVariable:
         observed = model.rvs_to_values[node.outputs[1]]
         self.observed = np.asarray(observed.eval(mode="FAST_COMPILE"), dtype=np.float64)
         self._evaluate = evaluator(LogLikelihood(self.system, self.filter, PANEL))
-        self._theta = AtPoints(model, [node.inputs[-5]])
+        self._theta = GraphsAtPoints(model, [node.inputs[-5]])
         others = [v for v in [*model.basic_RVs, *model.potentials] if v.name != name]
         self._others = RowFunction(model, model.logp(vars=others))
 

@@ -1,6 +1,6 @@
 """One record of a state-space variable at draws of the posterior: its parameters and states."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,7 +12,6 @@ from ..compiler.numerics.philox import seed_of_record
 from ..errors import ModelError
 from ..evaluation.simulate import observer
 from ..pymc_model.state_space_variable import (
-    Evaluation,
     StateSpaceVariable,
     states_of,
     term_health_of,
@@ -141,7 +140,7 @@ class RecordAtDraws:
 
     def evaluate(
         self,
-        evaluation: Evaluation,
+        evaluation: Callable[..., list[Array]],
         drawn: Mapping[str, np.ndarray],
         constant: Mapping[str, np.ndarray] | None = None,
         draws: slice = slice(None),

@@ -20,7 +20,7 @@ from pymc_statespace_filters.filters import (
     RunFilter,
     StatesFilter,
 )
-from pymc_statespace_filters.ops import at_rows
+from pymc_statespace_filters.ops import at_points
 from pymc_statespace_filters.ops.states import States
 from pymc_statespace_filters.testing import kalman_log_likelihood
 from tests.references.linear_states import linear_states
@@ -166,7 +166,7 @@ def test_it_is_sampled_and_gives_evidence_and_states(cubature):
 
 def test_all_records_of_a_panel_share_one_function(cubature, monkeypatch):
     """It takes seconds to compile."""
-    at_rows._without_plan.cache_clear()  # another test may have made it
+    at_points._without_plan.cache_clear()  # another test may have made it
     made = []
 
     def function(inputs, outputs, *arguments, _function=pytensor.function, **options):

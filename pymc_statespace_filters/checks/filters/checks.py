@@ -18,7 +18,7 @@ from ...filters.protocol import Filter
 from ...filters.rbpf import RBPF
 from ...filters.written import short_form
 from ...progress import row_progress
-from ...pymc_model.at_points import AtPoints
+from ...pymc_model.at_points import GraphsAtPoints
 from ...pymc_model.elements import element_names
 from ...pymc_model.filter_estimates import VariableAtPoints
 from ...pymc_model.inspection import log_density_terms, state_space_nodes
@@ -171,7 +171,7 @@ def _is_relevant(
 def _density_of_others(model: pm.Model, name: str, x: Array) -> Array:
     """The log-density of all variables and Potentials but one, (m,)."""
     others = [term.sum() for variable, term in log_density_terms(model) if variable != name]
-    found = np.sum(AtPoints(model, others)(x), axis=0)
+    found = np.sum(GraphsAtPoints(model, others)(x), axis=0)
     return np.where(np.isnan(found), -np.inf, found)
 
 

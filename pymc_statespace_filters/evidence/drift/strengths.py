@@ -15,7 +15,7 @@ from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
 from ...errors import ModelError
-from ...pymc_model.at_points import AtPoints
+from ...pymc_model.at_points import GraphsAtPoints
 from ...pymc_model.ends_of_support import ends_of_support
 from ...pymc_model.inspection import parameter_graphs, state_space_nodes
 from ...pymc_model.prior import is_improper
@@ -102,7 +102,7 @@ class StrengthsAtPoints:
         self._is_signed = np.concatenate([is_signed for _, is_signed in ends])
         scalars = pt.concatenate([pt.flatten(rv) for rv in chosen])
         jacobian = pt.sum(pt.stack([_log_jacobian(rv, model) for rv in chosen]))
-        self._at_points = AtPoints(model, [scalars, jacobian])
+        self._at_points = GraphsAtPoints(model, [scalars, jacobian])
 
     def __call__(self, x: Array) -> Strengths:
         """At points x (n, k)."""
