@@ -19,7 +19,7 @@ from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.states import TermHealth
 from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.parameters import flat_parameters
-from pymc_statespace_filters.system.record import checked_record
+from pymc_statespace_filters.system.record import read_record
 from tests.references.records import PRECISE_DOUBLE_WELL, SURPRISES, double_well_with_surprises
 from tests.systems import DOUBLE_WELL_SYSTEM, double_well_parameters
 
@@ -158,7 +158,7 @@ PARAMETERS = double_well_parameters(PRECISE_DOUBLE_WELL)
 
 
 def term_health(filter, observed, steps, seed=0):
-    record = checked_record(DOUBLE_WELL_SYSTEM, GivenRecord(observed, steps=steps)).arguments
+    record = read_record(DOUBLE_WELL_SYSTEM, GivenRecord(observed, steps=steps)).arguments
     theta = flat_parameters(DOUBLE_WELL_SYSTEM, PARAMETERS)
     return evaluator(TermHealth(DOUBLE_WELL_SYSTEM, filter))(theta, *record, np.asarray(seed))
 
