@@ -19,10 +19,9 @@ import numpy as np
 import pymc as pm
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.diagnostics.constancy.axis import TimeAxis
 from pymc_statespace_filters.diagnostics.constancy.estimation import expected_information, modes
-from pymc_statespace_filters.diagnostics.constancy.simulations import ConstancyTest
-from pymc_statespace_filters.diagnostics.constancy.statistics import constancy
+from pymc_statespace_filters.diagnostics.constancy.statistics import ConstancyTest, constancy
+from pymc_statespace_filters.diagnostics.constancy.table import TimeAxis
 from pymc_statespace_filters.pymc_model.term_scores import ScoredVariable
 from tests.systems import driven, driven_by_wandering_gain
 

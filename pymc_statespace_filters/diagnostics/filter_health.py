@@ -15,7 +15,7 @@ from ..filters.protocol import HealthFilter
 from ..pymc_model.checked_model import checked_model
 from ..pymc_model.state_space_variable import StateSpaceVariable
 from ..states.draws import select_draws
-from ..states.groups import add_group, by_record, coords_of_steps, join_rows
+from ..states.groups import add_group, by_record, results_by_row, times_of
 from ..states.record import Array, RecordAtDraws, States, TermHealthAtDraws, simulate_observations
 from ..states.variable import VariableAtDraws, select_variables
 from ..system.checks import check_random_seed
@@ -173,7 +173,16 @@ def filter_diagnostics(
         records = zip(at_draws.records, at_draws.generators(rng), strict=True)
         with at_draws.progress("predictions", enabled=progressbar, n_tasks=3):
             found = [_of_record(record, own) for record, own in records]
-        part = _results_by_draw(at_draws, found)
+        name = variable.name
+        part = results_by_row(
+            at_draws,
+            times_of(at_draws, [one.record.steps for one in found]),
+            {
+                f"{name}_predicted": ("observable", [one.predicted for one in found]),
+                f"{name}_n_effective": ("", [one.health.n_effective for one in found]),
+            },
+        )
+        part[f"{name}_predicted"].attrs = {"filter": repr(variable.filter)}
         observed = [one.record.scored for one in found]
         part = part.merge(_results_by_row(variable, [one.calibration for one in found], observed))
         part = part.merge(by_record(at_draws, [_results_by_record(one) for one in found]))
@@ -229,30 +238,6 @@ def _term_health(
         return record.term_health(rng)
     states = record.states("filtered", record.steps, rng) if filter.noisy else before
     return TermHealthAtDraws(states.seeds, states.n_effective, states.health)
-
-
-def _results_by_draw(at_draws: VariableAtDraws, found: list[_Found]) -> xr.Dataset:
-    """Predictions and effective sample sizes of every draw."""
-    variable = at_draws.variable
-    name, (time, observable) = variable.name, variable.dims
-    results = at_draws.draws.dataset(
-        {
-            f"{name}_predicted": (
-                (time, observable),
-                join_rows([one.predicted for one in found]),
-            ),
-            f"{name}_n_effective": (
-                (time,),
-                join_rows([one.health.n_effective for one in found]),
-            ),
-        },
-        {
-            **coords_of_steps(at_draws, [one.record.steps for one in found]),
-            observable: list(variable.system.observables),
-        },
-    )
-    results[f"{name}_predicted"].attrs = {"filter": repr(variable.filter)}
-    return results
 
 
 def _results_by_row(

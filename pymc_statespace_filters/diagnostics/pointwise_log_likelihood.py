@@ -15,7 +15,7 @@ from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.sequential_terms import warn_of_sequence
 from ..pymc_model.state_space_variable import StateSpaceVariable, terms_of
 from ..states.draws import PosteriorDraws, select_draws
-from ..states.groups import add_group, coords_of_steps
+from ..states.groups import add_group, results_by_row, times_of
 from ..states.record import Array, RecordAtDraws
 from ..states.variable import VariableAtDraws, select_variables
 
@@ -148,9 +148,8 @@ def sequential_terms(
     """
     at_draws = VariableAtDraws(model, variable, draws)
     name, (record,) = variable.name, at_draws.records
-    (terms,) = _terms(at_draws, progressbar)
-    coords = coords_of_steps(at_draws, [record.steps])
-    found = draws.dataset({name: (variable.dims[:1], terms)}, coords)[name]
+    times = times_of(at_draws, [record.steps])
+    found = results_by_row(at_draws, times, {name: ("", _terms(at_draws, progressbar))})[name]
     return found.assign_attrs(terms=SEQUENTIAL)
 
 

@@ -15,7 +15,7 @@ from ..system.checks import check_random_seed
 from ..system.own_units import in_own_units, moments_in_own_units
 from ..system.steps import check_at, rows_at
 from .draws import select_draws
-from .groups import add_group, coords_of_steps, join_rows, state_dims
+from .groups import add_group, results_by_row, state_dims, times_of
 from .variable import VariableAtDraws, select_variables
 
 
@@ -206,18 +206,18 @@ def _add_states(
                     steps, at_draws.records, at_draws.generators(rng), strict=True
                 )
             ]
-        _, mean, sd, drawn, n_effective, _ = zip(*states, strict=True)
         name, system = variable.name, variable.system
-        time, state = variable.dims[0], dims[name]
-        means, sds = moments_in_own_units(system, join_rows(mean), join_rows(sd))
-        part = draws.dataset(
+        own_units = [moments_in_own_units(system, one.mean, one.sd) for one in states]
+        part = results_by_row(
+            at_draws,
+            times_of(at_draws, steps),
             {
-                f"{name}_states": ((time, state), in_own_units(system, join_rows(drawn))),
-                f"{name}_mean": ((time, state), means),
-                f"{name}_sd": ((time, state), sds),
-                f"{name}_n_effective": ((time,), join_rows(n_effective)),
+                f"{name}_states": ("state", [in_own_units(system, one.drawn) for one in states]),
+                f"{name}_mean": ("state", [mean for mean, _ in own_units]),
+                f"{name}_sd": ("state", [sd for _, sd in own_units]),
+                f"{name}_n_effective": ("", [one.n_effective for one in states]),
             },
-            {**coords_of_steps(at_draws, steps), state: list(system.states)},
+            dims[name],
         )
         part[f"{name}_states"].attrs = {
             "filter": repr(variable.filter),

@@ -26,7 +26,7 @@ from ..system.steps import GRID_TOLERANCE, check_steps
 from ..system.time_axis import TimeAxis, TimesBetween, axis_of, check_increasing, is_grid
 from ..system.timed_inputs import check_inputs_at, timed_inputs
 from .draws import select_draws
-from .groups import add_group, join_rows, row_coords, state_dims
+from .groups import add_group, results_by_row, state_dims
 from .record import Array, RecordAtDraws
 from .variable import VariableAtDraws, select_variables
 
@@ -126,7 +126,7 @@ def forecast(
     dims = state_dims(observed_variables(model))
     parts = []
     for variable in select_variables(model, var_name, filter):
-        name, system, (time, observable) = variable.name, variable.system, variable.dims
+        name, system = variable.name, variable.system
         at_draws = VariableAtDraws(model, variable, draws)
         timed = _timed_inputs(at_draws, inputs, input_times, inputs_at)
         axes = [
@@ -160,22 +160,14 @@ def forecast(
                 paths.append(path)
                 simulated.append(seen)
         parts.append(
-            draws.dataset(
+            results_by_row(
+                at_draws,
+                [axis.times(rows) for axis, rows in zip(axes, future, strict=True)],
                 {
-                    name: ((time, observable), join_rows(simulated)),
-                    f"{name}_states": (
-                        (time, dims[name]),
-                        in_own_units(system, join_rows(paths)),
-                    ),
+                    name: ("observable", simulated),
+                    f"{name}_states": ("state", [in_own_units(system, path) for path in paths]),
                 },
-                {
-                    **row_coords(
-                        at_draws,
-                        [axis.times(rows) for axis, rows in zip(axes, future, strict=True)],
-                    ),
-                    dims[name]: list(system.states),
-                    observable: list(system.observables),
-                },
+                dims[name],
             )
         )
         at_draws.warn_about([one.health for one in initial], [one.seeds for one in initial])

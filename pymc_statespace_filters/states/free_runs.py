@@ -27,7 +27,7 @@ from ..system.placement import Placement, Timing, place_by
 from ..system.record import check_inputs, check_observed
 from ..system.timed_inputs import check_inputs_at
 from .draws import SAMPLE_DIMS, select_draws
-from .groups import add_group, by_record, join_rows, row_coords, state_dims
+from .groups import add_group, by_record, results_by_row, state_dims
 from .record import Array, RecordAtDraws, simulate_observations
 from .variable import VariableAtDraws, select_variables
 
@@ -184,20 +184,14 @@ def free_run(
                     predicted = draws.dataset({name: ((time, observable), values)}, names)[name]
                     errors.append(prediction_errors(predicted, noisy, measured))
         _warn_of_failed_runs(name, paths)
-        state = dims[name]
-        part = draws.dataset(
+        part = results_by_row(
+            at_draws,
+            [one.axes[0].times(one.axes[0].steps) for one in placed],
             {
-                name: ((time, observable), join_rows(seen)),
-                f"{name}_states": (
-                    (time, state),
-                    in_own_units(variable.system, join_rows(paths)),
-                ),
+                name: ("observable", seen),
+                f"{name}_states": ("state", [in_own_units(variable.system, one) for one in paths]),
             },
-            {
-                **row_coords(at_draws, [one.axes[0].times(one.axes[0].steps) for one in placed]),
-                **names,
-                state: list(variable.system.states),
-            },
+            dims[name],
         )
         if errors:
             part = part.merge(by_record(at_draws, errors))

@@ -22,15 +22,41 @@ def state_dims(variables: Sequence[StateSpaceVariable]) -> dict[str, str]:
     }
 
 
-def coords_of_steps(
-    at_draws: VariableAtDraws, steps: Sequence[NDArray[np.int64]]
-) -> dict[str, Any]:
-    """Coordinates of the rows of a result, given the steps of each record in the data."""
+def results_by_row(
+    at_draws: VariableAtDraws,
+    times: Sequence[Array],
+    found: Mapping[str, tuple[str, Sequence[Array]]],
+    state: str = "",
+) -> xr.Dataset:
+    """Results by draw and row, (chain, draw, R, ...), with the coordinates of rows and of names.
+
+    ``times`` are those of the rows of each record. Of each of the ``found`` there is the dimension
+    after the rows, "state" or "observable" or "" for none, and the array (draws, rows, ...) of each
+    record. ``state`` is the name of the dimension of states.
+    """
+    variable = at_draws.variable
+    time, observable = variable.dims
+    names = {
+        "state": (state, list(variable.system.states)),
+        "observable": (observable, list(variable.system.observables)),
+    }
+    used = [names[kind] for kind, _ in found.values() if kind]
+    return at_draws.draws.dataset(
+        {
+            name: ((time, names[kind][0]) if kind else (time,), np.concatenate(parts, axis=1))
+            for name, (kind, parts) in found.items()
+        },
+        _row_coords(at_draws, times) | dict(used),
+    )
+
+
+def times_of(at_draws: VariableAtDraws, steps: Sequence[NDArray[np.int64]]) -> list[Array]:
+    """The times of some steps of each record in the data."""
     pairs = zip(at_draws.records, steps, strict=True)
-    return row_coords(at_draws, [record.axis.times(rows) for record, rows in pairs])
+    return [record.axis.times(rows) for record, rows in pairs]
 
 
-def row_coords(at_draws: VariableAtDraws, times: Sequence[Array]) -> dict[str, Any]:
+def _row_coords(at_draws: VariableAtDraws, times: Sequence[Array]) -> dict[str, Any]:
     """Coordinates of the rows of a result, given the times of each record.
 
     Without a panel they are times. The rows of a panel have record and time as further coordinates.
@@ -60,11 +86,6 @@ def by_record(at_draws: VariableAtDraws, parts: Sequence[xr.Dataset]) -> xr.Data
     dim = f"{at_draws.variable.name}_record"
     labels = xr.DataArray([record.label for record in at_draws.records], dims=dim, name=dim)
     return xr.concat(parts, labels, data_vars="all", coords="minimal", join="outer")
-
-
-def join_rows(parts: Sequence[Array]) -> Array:
-    """The rows of all records (draws, R, ...), one after the other."""
-    return np.concatenate(parts, axis=1)
 
 
 def add_group(

@@ -10,14 +10,19 @@ from scipy.stats import kstest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.diagnostics import drift_scan
-from pymc_statespace_filters.diagnostics.constancy.axis import TimeAxis
-from pymc_statespace_filters.diagnostics.constancy.simulations import ConstancyTest, Statistics
 from pymc_statespace_filters.diagnostics.constancy.statistics import (
+    ConstancyTest,
+    Statistics,
     _from_each_row,
     constancy,
     p_values,
 )
-from pymc_statespace_filters.diagnostics.constancy.table import _changes, _turns, sentences
+from pymc_statespace_filters.diagnostics.constancy.table import (
+    TimeAxis,
+    _changes,
+    _turns,
+    sentences,
+)
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.pymc_model.term_scores import ScoredVariable
 from tests.systems import DUFFING, driven, driven_by_wandering_gain

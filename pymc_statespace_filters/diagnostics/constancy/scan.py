@@ -17,9 +17,8 @@ from ...pymc_model.posterior_draws import unconstrained_draws
 from ...pymc_model.term_scores import ScoredVariable
 from ...states.variable import select_variables
 from ...system.checks import check_count, check_random_seed
-from .axis import TimeAxis
-from .simulations import ConstancyTest
-from .table import scan_table
+from .statistics import ConstancyTest
+from .table import TimeAxis, scan_table
 
 N_TRIED = 64  # draws, of which the best is where the search of the mode begins
 FEWEST = 19  # simulated data sets
