@@ -136,14 +136,14 @@ def plot_filter_health(
     residual = found["residual"]
     chance = residual.count("time") ** -0.5
     panels, bounds = {"residual": residual}, {"residual": 0.0 * chance + TAIL}
-    if "autocorrelation" in found:
+    if _has(found, "autocorrelation"):
         panels["autocorrelation"], bounds["autocorrelation"] = (
             found["autocorrelation"],
             TAIL * chance,
         )
     pit, pit_bounds = _pit(found["pit"])
     panels["pit"] = pit["pit"]
-    if "input_correlation" in found and found["input_correlation"].notnull().any():
+    if _has(found, "input_correlation"):
         panels["inputs"], largest = _largest(found["input_correlation"])
         bounds["inputs"] = largest * chance
     shown, limits = xr.Dataset(panels), xr.Dataset(bounds)
@@ -164,7 +164,7 @@ def plot_filter_health(
     title = dict.fromkeys(
         map(str, shown), titles_of(shown, ["observable"]) if n_columns > 1 else ""
     )
-    if "n_effective" in found and np.isfinite(found["n_effective"]).any():
+    if _has(found, "n_effective") and np.isfinite(found["n_effective"]).any():
         logs, of_effective = _effective(found)
         shown, marks = shown.assign(logs), marks + of_effective
         title["effective"] = _failures(idata)
@@ -181,6 +181,11 @@ def plot_filter_health(
         backend=backend,
         pc_kwargs=pc_kwargs,
     )
+
+
+def _has(found: xr.Dataset, name: str) -> bool:
+    """Whether there are values to draw."""
+    return name in found and bool(found[name].notnull().any())
 
 
 def _largest(correlation: xr.DataArray) -> tuple[xr.DataArray, float]:

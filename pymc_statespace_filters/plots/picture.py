@@ -164,15 +164,12 @@ def _texts(frames: xr.Dataset, given: Any) -> xr.Dataset:
 
 def _below(frames: xr.Dataset, text: str, in_line: int) -> xr.Dataset:
     """The text for the lowest panels, and none for the others."""
-    places = iter(range(sum(frame.size for frame in frames.values()), 0, -1))
-    return frames.map(
-        lambda frame: frame.copy(
-            data=np.reshape(
-                np.array([text if next(places) <= in_line else "" for _ in range(frame.size)]),
-                frame.shape,
-            )
-        )
-    )
+    found, n_left = {}, sum(frame.size for frame in frames.values())
+    for name, frame in frames.items():
+        from_last = n_left - np.arange(frame.size).reshape(frame.shape)
+        found[name] = frame.copy(data=np.where(from_last <= in_line, text, ""))
+        n_left -= frame.size
+    return xr.Dataset(found)
 
 
 def _figure(
@@ -232,11 +229,12 @@ def _draw_key(collection: PlotCollection, marks: Sequence[Mark]) -> None:
     key = drawing.legend(collection, styles, list(samples), update_visuals=False, **place)
     for i, (label, style) in enumerate(samples.items()):
         if "marker" in style and backend == "plotly":
-            collection.viz["figure"].item().update_traces({"mode": "markers"}, {"name": label})
+            symbol = drawing.get_default_aes("marker", 4)[int(style["marker"][1:])]
+            as_point = {"mode": "markers", "marker": {"symbol": symbol}}
+            collection.viz["figure"].item().update_traces(as_point, {"name": label})
         if "marker" in style and backend == "bokeh":
-            point = drawing.scatter(
-                [np.nan], [np.nan], collection.iget_target(0, -1), color=style["color"]
-            )
+            look = {key: style[key] for key in ("color", "marker")}
+            point = drawing.scatter([np.nan], [np.nan], collection.iget_target(0, -1), **look)
             key.items[i].renderers = [point]
 
 

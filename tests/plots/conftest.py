@@ -12,6 +12,14 @@ from pymc_statespace_filters import average_models, compare_evidence
 from pymc_statespace_filters.diagnostics.constancy.table import DriftScan
 from pymc_statespace_filters.evidence import Evidence
 
+TERMS = xr.Dataset(
+    {
+        "inclusion": ("term", [0.12, 0.98, 0.5]),
+        "inclusion_se": ("term", [0.01, 0.02, 0.0]),
+        "prior_inclusion": ("term", [0.5, 0.4, 0.5]),
+    },
+    coords={"term": ["c2", "k3", "k_f, k_h"]},
+)
 X = xr.DataArray(np.linspace(-2, 2, 9), coords=[("displacement", np.linspace(-2, 2, 9))])
 
 

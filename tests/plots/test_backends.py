@@ -18,7 +18,7 @@ from pymc_statespace_filters import (
     plot_states,
     plot_terms,
 )
-from tests.plots.test_terms import TERMS
+from tests.plots.conftest import TERMS
 
 
 def run_free(idata, **settings):
@@ -69,7 +69,7 @@ def curves_of(models):
     )
 
 
-@pytest.mark.parametrize("backend", ["none", "plotly", "bokeh"])
+@pytest.mark.parametrize("backend", ["plotly", "bokeh"])
 @pytest.mark.parametrize(("plot", "result"), PLOTS)
 def test_every_other_backend(plot, result, backend, request):
     collection = plot(request.getfixturevalue(result), backend=backend)
@@ -141,27 +141,22 @@ def test_long_names_of_rows_leave_the_axis_its_label(plot, table):
     assert axes.bbox.width > 0.45 * figure.bbox.width
 
 
-@pytest.mark.parametrize("backend", ["plotly", "bokeh"])
-def test_the_key_names_what_is_drawn(backend, states):
+@pytest.mark.parametrize("backend", ["matplotlib", "plotly", "bokeh"])
+def test_the_key_names_what_is_drawn_and_shows_points_as_points(backend, states):
     collection = plot_states(states, backend=backend)
-    if backend == "plotly":
-        names = [trace.name for trace in collection.viz["figure"].item().data if trace.showlegend]
+    figure = collection.viz["figure"].item()
+    if backend == "matplotlib":
+        (key,) = figure.legends
+        names = [text.get_text() for text in key.get_texts()]
+        point = key.get_lines()[2]
+        assert (point.get_marker(), point.get_linestyle()) == ("o", "None")
+    elif backend == "plotly":
+        names = [trace.name for trace in figure.data if trace.showlegend]
+        (point,) = figure.select_traces({"name": "data"})
+        assert (point.mode, point.marker.symbol) == ("markers", "circle")
     else:
         (key,) = collection.iget_target(0, -1).legend
         names = [item.label.value for item in key.items]
-    assert names == ["90 %", "50 %", "data", "median"]
-
-
-@pytest.mark.parametrize("backend", ["matplotlib", "plotly", "bokeh"])
-def test_the_key_of_points_is_a_point(backend, states):
-    collection = plot_states(states, backend=backend)
-    if backend == "matplotlib":
-        (point,) = collection.viz["figure"].item().legends[0].get_lines()[2:3]
-        assert (point.get_marker(), point.get_linestyle()) == ("o", "None")
-    elif backend == "plotly":
-        (point,) = collection.viz["figure"].item().select_traces({"name": "data"})
-        assert point.mode == "markers"
-    else:
-        (key,) = collection.iget_target(0, -1).legend
         (point,) = key.items[2].renderers
         assert point.glyph.marker == "circle"
+    assert names == ["90 %", "50 %", "data", "median"]
