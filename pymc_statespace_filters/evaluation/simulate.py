@@ -93,7 +93,7 @@ def _simulation(observe: Any) -> Callable:
         if functions.initialise != 0:
             start = np.zeros(functions.n_start)
             _draw(rng, functions, start)
-            _call(functions.initialise, c, inputs, 0, t0, start, x, x)
+            _call(functions.initialise, c, inputs, np.int64(0), t0, start, x, x)
         else:  # by the mean itself: the covariance may be infinite
             copy_into(x[:, 0], c[functions.n_theta : functions.n_theta + functions.n])
         j = 0

@@ -1,5 +1,6 @@
 """What all Gaussian filters share: everything but their linearisation and the systems they take."""
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import ClassVar
 
@@ -69,31 +70,36 @@ class GaussianFilterBase(TapedFilter):
         self, system: System, *, leaves_tape: bool = False, goes_back: bool = False
     ) -> Plan:
         """Plan a pass along many records, or of many points, side by side if that fits."""
-        run = BACKWARD if goes_back else FORWARD
-        return self._plan(system, run, of_many=True, leaves_tape=leaves_tape)
+        runs = BACKWARD if goes_back else FORWARD
+        return self._plan(system, runs, of_many=True, leaves_tape=leaves_tape)
 
     def compile_states(self, system: System, moment: str) -> PlannedFunction:
         """Compile "predicted", "filtered" or "smoothed" states; smoothed draws are paths."""
         if system.is_deterministic:
-            return PlannedFunction(self._plan(system, RUN_STATES), *STATES)
+            return PlannedFunction(self._plan(system, (RUN_STATES,)), *STATES)
         recursion = self._functions(system)
         plan = states_plan(system, recursion, self._linearizations(system), moment)
         return PlannedFunction(plan, *STATES)
 
     def compile_run(self, system: System) -> PlannedFunction:
         """Compile one run with all that it computes."""
-        return PlannedFunction(self._plan(system, RUN_STATES), *RUN)
+        return PlannedFunction(self._plan(system, (RUN_STATES,)), *RUN)
 
     def law_of_state(self, system: System, states: np.ndarray) -> StateLaw:
         """Return the law of the state, from what the filter leaves (m, S) at m points."""
         return law_of_moments(states, system.n)
 
     def _plan(
-        self, system: System, run: EntryPoint, *, of_many: bool = False, leaves_tape: bool = False
+        self,
+        system: System,
+        runs: Sequence[EntryPoint],
+        *,
+        of_many: bool = False,
+        leaves_tape: bool = False,
     ) -> Plan:
         return filter_plan(
-            system, self._functions(system), run, of_many=of_many, leaves_tape=leaves_tape,
-            goes_back=run is BACKWARD,
+            system, self._functions(system), runs, of_many=of_many, leaves_tape=leaves_tape,
+            goes_back=runs is BACKWARD,
         )  # fmt: skip
 
     def smoothing_method(self, system: System) -> str:

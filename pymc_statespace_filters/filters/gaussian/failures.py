@@ -35,7 +35,7 @@ def failure_along(machine, W, table, row, s, term):
             before=table.before,
         )  # fmt: skip
         copy(s, states[: m.size])
-        taken[i] = call_along(m.along, m, W, trial, record, states, 0, no_term) == 1
+        taken[i] = call_along(m.along, m, W, trial, record, states, np.int64(0), no_term) == 1
     return _failure(m, s[: m.size], term, taken)
 
 

@@ -241,13 +241,15 @@ def compiled(
 def filter_plan(
     system: System,
     recursion: GaussianFilterFunctions,
-    run: EntryPoint,
+    runs: Sequence[EntryPoint],
     *,
     of_many: bool,
     leaves_tape: bool,
     goes_back: bool,
 ) -> Plan:
     """The plan of a pass along one record, or along many, in lanes if these fit.
+
+    ``runs`` are the functions for records one after the other, and side by side.
 
     For a pass that leaves a tape or goes back along it, the functions of a gradient must fit too.
     """
@@ -260,7 +262,7 @@ def filter_plan(
     theta = recursion.start.inputs["theta"]
     covs = covariances_at(recursion.system, theta)
     return make_plan(
-        system, run, (), checked(recursion.system, covs, theta.type.shape[0]), **entries,
+        system, runs[in_lanes], (), checked(recursion.system, covs, theta.type.shape[0]), **entries,
         state_size=recursion.size, n_lanes=used.n_lanes, n_rows=used.n_rows,
         n_covariances=covs.values.type.shape[0], leaves_tape=leaves_tape,
     )  # fmt: skip

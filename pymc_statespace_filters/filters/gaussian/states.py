@@ -18,6 +18,7 @@ from ..calls import OK, opened, reals_at, wanted_rows
 from ..outcomes import NONE, OUT_OF_MEMORY, is_missing
 from ..plan import PLAN, make_plan, settings_of
 from ..protocol import System
+from .alone import n_states_on_tape
 from .bryson_frazier import BrysonFrazier
 from .forward import forward_pass
 from .functions import (
@@ -33,7 +34,6 @@ from .group import (
     N_OF_RECORD,
     copy,
     load_parameters,
-    n_states_on_tape,
     parameters_of,
     records_of,
     set_all,
@@ -92,10 +92,10 @@ def n_steps_of(table):
 @njit_internal
 def taped_pass(opening, machine, covariances, table, health):
     """Terms, a tape of all states, and the first step without one."""
-    records, to = records_of(opening, machine), opening.results
+    records, to = records_of(opening), opening.results
     n_rows, size = opening.record[RECORD.n_rows], machine.size
     terms = reals_at(to[RESULTS.terms], (n_rows,)) if to[RESULTS.terms] else np.empty(n_rows)
-    tape = np.empty(n_states_on_tape(opening, machine, records) * size)
+    tape = np.empty(n_states_on_tape(machine, table.rows, records) * size)
     n_taped = forward_pass(
         machine, covariances, table, records, tape, terms, health, states_wanted(opening)
     )
