@@ -12,7 +12,7 @@ import numpy as np
 
 from ..filters.protocol import BatchFilter
 from ..filters.signatures import ONE_RECORD, PANEL, POINTS
-from ..system.panel_records import N_COLUMNS, RECORD, STEP
+from ..system.panel_records import rows_of_copies
 from .base import FilterOp, evaluator
 from .likelihood import LogLikelihood, LogLikelihoodGradient, TapedLogLikelihood, TapePullback
 
@@ -92,16 +92,9 @@ def _shared(record: Arrays, cores: Sequence[Shape]) -> list[np.ndarray]:
 def _one_panel(thetas: np.ndarray, record: Arrays) -> tuple[np.ndarray, ...]:
     """The records of all points below each other, as those of one panel."""
     steps, observed, *others = record
-    rows = steps
-    if steps.ndim == 1:
-        rows = np.zeros((len(steps), N_COLUMNS), np.int64)
-        rows[:, STEP] = steps
-    number = np.cumsum(np.diff(rows[:, RECORD], prepend=rows[0, RECORD]) != 0)
-    n_points, n_records = len(thetas), number[-1] + 1
-    table = np.tile(rows, (n_points, 1))
-    table[:, RECORD] = np.add.outer(np.arange(n_points) * n_records, number).ravel()
+    n_points = len(thetas)
     below = thetas.reshape(-1, thetas.shape[-1])
-    return below, table, np.tile(observed, (n_points, 1)), *others
+    return below, rows_of_copies(steps, n_points), np.tile(observed, (n_points, 1)), *others
 
 
 def _in_turn(op: FilterOp, arguments: Arrays, shape: Shape, cores: list[Shape]) -> list[np.ndarray]:

@@ -16,7 +16,7 @@ from pytensor.tensor.variable import TensorVariable
 from ..compiler.native.cache_key import key_of
 from ..errors import ModelError
 from ..evaluation.simulate import simulator
-from ..filters.signatures import PANEL
+from ..filters.signatures import ONE_RECORD, PANEL
 from ..ops.likelihood import LogLikelihood, vectorized
 from ..ops.unplanned import cache_key, check_of_rows, end_of_record, single_record
 from ..system.panel_records import FIRST_INPUT, RECORD, STEP
@@ -121,32 +121,21 @@ def _log_density(
     _warn_about_model(op)
     warn_of_steps(op.system, theta)
     inputs = inputs_as_seen(op, inputs, steps, value)
-    likelihood = LogLikelihood(op.system, op.filter)
+    form = PANEL if isinstance(op, PanelRV) else ONE_RECORD
+    likelihood = LogLikelihood(op.system, op.filter, form)
     terms = vectorized(likelihood, theta, steps, value, inputs, t0, seed)[0]
-    if op.score_from == 0:
-        return terms
+    return terms if op.score_from == 0 else pt.switch(_is_scored(op, steps), terms, 0.0)
+
+
+def _is_scored(op: StateSpaceRV, steps: TensorVariable) -> TensorVariable:
+    """Whether each row counts: the first ones of every record do not."""
+    if isinstance(op, PanelRV):
+        codes = steps[..., RECORD]
+        # A row counts if the row so many rows before it belongs to the same record.
+        counts = pt.eq(codes[..., op.score_from :], codes[..., : -op.score_from])
+        before = pt.zeros((*codes.shape[:-1], op.score_from), dtype="bool")
+        return pt.concatenate([before, counts], axis=-1)
     # The length comes from the steps, which do not depend on the parameters as the terms do.
     n_rows = steps.shape[-1]
     rows = CheckAndRaise(ModelError, _TOO_SHORT)(pt.arange(n_rows), pt.gt(n_rows, op.score_from))
-    return pt.switch(pt.ge(rows, op.score_from), terms, 0.0)
-
-
-@_logprob.register(PanelRV)
-def _log_density_of_panel(
-    op: PanelRV, values: Sequence, rng: Variable, size: Variable, *params: Any, **kwargs: Any
-) -> TensorVariable:
-    """The same for every record; the first rows of each are not scored."""
-    (value,) = values
-    theta, rows, inputs, t0, seed = params
-    _warn_about_model(op)
-    warn_of_steps(op.system, theta)
-    inputs = inputs_as_seen(op, inputs, rows, value)
-    likelihood = LogLikelihood(op.system, op.filter, PANEL)
-    terms = vectorized(likelihood, theta, rows, value, inputs, t0, seed)[0]
-    if op.score_from == 0:
-        return terms
-    codes = rows[..., RECORD]
-    # A row counts if the row so many rows before it belongs to the same record.
-    counts = pt.eq(codes[..., op.score_from :], codes[..., : -op.score_from])
-    before = pt.zeros((*codes.shape[:-1], op.score_from), dtype="bool")
-    return pt.switch(pt.concatenate([before, counts], axis=-1), terms, 0.0)
+    return pt.ge(rows, op.score_from)

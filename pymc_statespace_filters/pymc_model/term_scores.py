@@ -17,7 +17,7 @@ from ..filters.signatures import PANEL
 from ..filters.written import short_form
 from ..ops.base import evaluator
 from ..ops.likelihood import LogLikelihood
-from ..system.panel_records import FIRST_INPUT, N_COLUMNS, RECORD, STEP, records_of
+from ..system.panel_records import FIRST_INPUT, RECORD, STEP, records_of, rows_of_copies
 from .at_points import GraphsAtPoints
 from .density import RowFunction, check_free_variables
 from .inspection import scored_rows, state_space_nodes
@@ -75,7 +75,7 @@ class ScoredVariable:
         table, self._inputs, self.t0 = (graph.eval(mode="FAST_COMPILE") for graph in record)
         self.is_panel = table.ndim == 2
         self._arguments = table
-        self._rows = table if self.is_panel else _rows(table)
+        self._rows = table if self.is_panel else rows_of_copies(table, 1)
         self.records = records_of(self._rows[:, RECORD])
         self.of_rows = self.records.of_rows()
         observed = model.rvs_to_values[node.outputs[1]]
@@ -135,9 +135,7 @@ class ScoredVariable:
     def terms(self, theta: Array, observed: Array) -> Array:
         """Terms (m, J) of data sets (m, J, p) at parameters (m, G, k); 0 of rows not scored."""
         m, n_rows = observed.shape[:2]
-        table = np.tile(self._rows, (m, 1))
-        records = np.add.outer(np.arange(m) * self.n_records, self.of_rows)
-        table[:, RECORD] = records.ravel()
+        table = rows_of_copies(self._rows, m)
         below = theta.reshape(-1, theta.shape[-1]), table, observed.reshape(m * n_rows, -1)
         found = self._evaluate(*below, self._inputs, self.t0, np.asarray(0))[0]
         kept = np.zeros(n_rows)
@@ -163,13 +161,6 @@ class ScoredVariable:
         up, down = (self.theta((x[:, None] + t * moves).reshape(-1, x.shape[1])) for t in (1, -1))
         difference = (up - down).reshape(len(x), x.shape[1], *up.shape[1:])
         return np.moveaxis(difference, 1, -1) / (2 * STEP_OF_X)
-
-
-def _rows(steps: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The rows (J, 3) of a panel with a single record."""
-    rows = np.zeros((len(steps), N_COLUMNS), np.int64)
-    rows[:, STEP] = steps
-    return rows
 
 
 def _check_filter(name: str, filter: object) -> None:

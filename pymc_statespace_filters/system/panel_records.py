@@ -88,6 +88,18 @@ def records_of(panel: Any) -> Records:
     return Records(found, starts, codes[starts[:-1]])
 
 
+def rows_of_copies(steps: np.ndarray, n: int) -> np.ndarray:
+    """The rows of a panel of n copies of a record (J,), or of the records of a panel (J, 3)."""
+    rows = steps
+    if steps.ndim == 1:
+        rows = np.zeros((len(steps), N_COLUMNS), np.int64)
+        rows[:, STEP] = steps
+    number = np.cumsum(np.diff(rows[:, RECORD], prepend=rows[0, RECORD]) != 0)
+    copies = np.tile(rows, (n, 1))
+    copies[:, RECORD] = np.add.outer(np.arange(n) * (number[-1] + 1), number).ravel()
+    return copies
+
+
 def _integers_or_texts(labels: np.ndarray) -> np.ndarray:
     """Labels of one kind, integers or objects; tables hold integers also as floats and objects."""
     if labels.dtype.kind == "f":
