@@ -12,7 +12,7 @@ from pytensor.graph.replace import vectorize_graph
 from benchmarks.systems import STEPS, SYSTEMS, simulated, theta_of
 from benchmarks.timing import Timed
 from pymc_statespace_filters.ops.likelihood import LogLikelihood, LogLikelihoodOfNoise, StoredNoise
-from pymc_statespace_filters.system.record import check_inputs
+from pymc_statespace_filters.system.input_columns import check_inputs
 from pymc_statespace_filters.system.time_axis import TimeAxis
 
 

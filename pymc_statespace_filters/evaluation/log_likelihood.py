@@ -120,9 +120,10 @@ def log_likelihood(
         raise ModelError(f"cores must be 1 without a panel, whose records it divides, got {cores}")
     with communicator_of(comm) as ranks:
         if record.is_panel:
-            found = _of_panel(record, filter, params, seeds, n_threads)
+            theta = panel_parameters(record.system, params, record.records)
+            found = _of_panel(record, filter, theta, seeds, n_threads)
         else:
-            found = _at_points(record, filter, params, seeds, ranks)
+            found = _at_points(record, filter, flat_parameters(record.system, params), seeds, ranks)
         if ranks.rank == 0:
             tell_of_health(record.system, filter, found.health, found.arguments_of, record.labels)
     return found.terms
@@ -137,13 +138,12 @@ class _Found(NamedTuple):
 
 
 def _of_panel(
-    record: Record, filter: Filter, params: Any, seed: np.ndarray, n_threads: int
+    record: Record, filter: Filter, theta: np.ndarray, seed: np.ndarray, n_threads: int
 ) -> _Found:
     """All records, which threads share; if some fail, each is repeated to say which."""
     if seed.ndim:
         raise ModelError(f"seed must be one number for a panel, got shape {seed.shape}")
     system, records = record.system, record.records
-    theta = panel_parameters(system, params, records)
     evaluate = evaluator(LogLikelihood(system, filter, PANEL))
 
     def part(first: int, last: int) -> tuple:
@@ -167,11 +167,10 @@ def _of_panel(
 
 
 def _at_points(
-    record: Record, filter: Filter, params: Any, seeds: np.ndarray, ranks: Communicator
+    record: Record, filter: Filter, theta: np.ndarray, seeds: np.ndarray, ranks: Communicator
 ) -> _Found:
     """A record at all points, side by side if the filter can, else one by one."""
     system, arguments = record.system, record.arguments
-    theta = flat_parameters(system, params)
     try:
         shape = np.broadcast_shapes(theta.shape[:-1], seeds.shape)
     except ValueError:

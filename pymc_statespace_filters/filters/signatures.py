@@ -27,7 +27,8 @@ ONE_RECORD = Form("one record")
 POINTS = Form("points", ("theta", "terms", "health", "state"))
 """One record at many points: theta (B, k), state (B, S) -> terms (B, J), health (B, 3)."""
 PANEL = Form("panel", ("theta", "steps", "theta_bar"))
-"""All records of a panel, see `system.panel`: theta (G, k), rows (J, 3) -> terms (J,), health (3,).
+"""All records of a panel, see `system.record`: theta (G, k), rows (J, 3) -> terms (J,), health
+(3,).
 
 Health is that of the whole panel: the smallest effective number of particles, and code and row of
 the first failing record. A record that fails has terms of -inf, the others keep theirs.

@@ -29,7 +29,7 @@ class StateSpaceVariable(NamedTuple):
 
     ``dims`` names time and observables; theta and inputs may depend on the free variables. Terms of
     the rows before ``score_from`` do not count. The variable of a panel has theta (G, k) and rows
-    (J, 3), see `system.panel`, as steps. ``timed`` are the inputs of each record that have times.
+    (J, 3), see `system.record`, as steps. ``timed`` are the inputs of each record that have times.
     """
 
     name: str

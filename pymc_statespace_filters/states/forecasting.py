@@ -16,12 +16,16 @@ from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.state_space_variable import observed_variables
 from ..system.checks import check_random_seed, is_integer
 from ..system.given_record import inputs_with_times, own_inputs
-from ..system.input_columns import inputs_of_user, n_input_rows, only_seen
+from ..system.input_columns import (
+    inputs_of_other_shape,
+    inputs_of_user,
+    n_input_rows,
+    only_seen,
+)
 from ..system.labels import table_of
 from ..system.model import StateSpaceModel
 from ..system.own_units import in_own_units
 from ..system.placement import check_takes
-from ..system.record import inputs_of_other_shape
 from ..system.steps import GRID_TOLERANCE, check_steps
 from ..system.time_axis import TimeAxis, TimesBetween, axis_of, check_increasing, is_grid
 from ..system.timed_inputs import check_inputs_at, timed_inputs

@@ -20,11 +20,11 @@ from ..pymc_model.checked_model import checked_model
 from ..pymc_model.state_space_variable import observed_variables
 from ..system.checks import check_flag, check_random_seed, shortened
 from ..system.given_record import inputs_with_times
-from ..system.input_columns import only_seen
+from ..system.input_columns import check_inputs, only_seen
 from ..system.model import StateSpaceModel
 from ..system.own_units import in_own_units
 from ..system.placement import Placement, Timing, place_by
-from ..system.record import check_inputs, check_observed
+from ..system.record import check_observed
 from ..system.timed_inputs import check_inputs_at
 from .draws import SAMPLE_DIMS, select_draws
 from .groups import add_group, by_record, results_by_row, state_dims

@@ -1,4 +1,4 @@
-"""Columns of inputs that a system has beside those of its user.
+"""Inputs of a user, and the columns that a system has beside them.
 
 A row of inputs holds what is true during one step. The user gives the first columns. Behind them
 are, in this order,
@@ -11,7 +11,7 @@ are, in this order,
   a zero elsewhere.
 
 So filters, simulations and forecasts treat lengths, times and the rest as they treat inputs.
-Here these columns are made, read and hidden from the user.
+Here the user's are checked, and these columns are made, read and hidden from the user.
 """
 
 import warnings
@@ -20,10 +20,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pytensor.tensor as pt
+from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Constant, Variable
 from pytensor.tensor.variable import TensorVariable
 
-from ..errors import INSIDE, ModelWarning
+from ..errors import INSIDE, ModelError, ModelWarning
+from .checks import shortened
+from .labels import table_of
 from .panel_records import FIRST_INPUT, RECORD, STEP
 from .steps import GRID_TOLERANCE
 from .time_axis import TimeAxis
@@ -68,6 +71,64 @@ def reset(
         # A product, because a switch would count as an equation with a kink.
         x = pt.set_subtensor(x[i], (1.0 - input_row[column]) * x[i])
     return x
+
+
+def check_inputs(
+    inputs: Any, system: "StateSpaceModel", axis: TimeAxis, steps: Variable | None = None
+) -> Any:
+    """The inputs as (rows, n_input_columns); row k holds during step k.
+
+    Of a symbol, what is known is checked; ``steps`` is a symbol for those of the axis.
+    """
+    if isinstance(inputs, Variable):
+        if isinstance(inputs, SharedVariable):
+            _check_inputs_of_user(inputs.get_value(), system, axis)
+        rows: Any = inputs[:, None] if inputs.type.ndim == 1 and system.n_inputs == 1 else inputs
+        if not system.n_inputs or rows.type.ndim != 2:
+            raise inputs_of_other_shape(system, rows.type)
+    else:
+        rows = _check_inputs_of_user(inputs, system, axis)
+    return with_columns(system, rows, axis, steps)
+
+
+def inputs_of_other_shape(system: "StateSpaceModel", found: Any) -> ModelError:
+    """The error for inputs with other columns than those of the system."""
+    return ModelError(
+        f"inputs must have shape (steps, {system.n_inputs}), a column for each of "
+        f"{list(system.inputs)}, got {found}"
+    )
+
+
+def _check_inputs_of_user(inputs: Any, system: "StateSpaceModel", axis: TimeAxis) -> np.ndarray:
+    if inputs is None:
+        if system.n_inputs:
+            raise ModelError(
+                f"inputs must have a row per step and a column for each of {list(system.inputs)}, "
+                f"got None"
+            )
+        return np.zeros((0, 0))
+    if not system.n_inputs:
+        raise ModelError(
+            f"inputs must be None for a system without inputs, got {shortened(inputs)}; name them "
+            f"in the system (StateSpaceModel(inputs=[...]))"
+        )
+    array = table_of("inputs", inputs, system.inputs, "inputs")
+    if array.ndim != 2 or array.shape[1] != system.n_inputs:
+        raise inputs_of_other_shape(system, np.shape(inputs))
+    needed = n_input_rows(system, axis.steps)
+    if axis.starts is not None and len(array) not in (needed, axis.starts.size):
+        raise ModelError(
+            f"inputs must have times of their own (input_times=) where times are off the grid of "
+            f"steps, or a row for each of the {axis.starts.size - 1} steps between them, got "
+            f"{len(array)} rows"
+        )
+    if array.shape[0] < needed:
+        last_row = ", and the observation uses u" if system.observation_uses_inputs else ""
+        raise ModelError(
+            f"inputs must have at least {needed} rows, because the last observation is at step "
+            f"{axis.steps[-1]} (row k holds during step k{last_row}), got {array.shape[0]}"
+        )
+    return array
 
 
 def with_columns(

@@ -23,7 +23,7 @@ from ..errors import ModelError
 from .checks import shortened
 from .clock import Clock
 from .given_record import GivenRecord
-from .input_columns import n_input_rows, only_seen, warn_of_gaps_in_sums, with_columns
+from .input_columns import check_inputs, only_seen, warn_of_gaps_in_sums
 from .labels import table_of
 from .model import StateSpaceModel
 from .panel_records import ALONE, FIRST_INPUT, STEP, Records, records_of
@@ -221,64 +221,6 @@ def read_inputs(
     xp: Any = pt if any(isinstance(one, Variable) for one in rows) else np
     ends = xp.cumsum(xp.stack([one.shape[0] for one in rows]))
     return xp.concatenate(rows), xp.concatenate([[0], ends[:-1]])
-
-
-def check_inputs(
-    inputs: Any, system: StateSpaceModel, axis: TimeAxis, steps: Variable | None = None
-) -> Any:
-    """The inputs as (rows, n_input_columns); row k holds during step k.
-
-    Of a symbol, what is known is checked; ``steps`` is a symbol for those of the axis.
-    """
-    if isinstance(inputs, Variable):
-        if isinstance(inputs, SharedVariable):
-            _check_inputs_of_user(inputs.get_value(), system, axis)
-        rows: Any = inputs[:, None] if inputs.type.ndim == 1 and system.n_inputs == 1 else inputs
-        if not system.n_inputs or rows.type.ndim != 2:
-            raise inputs_of_other_shape(system, rows.type)
-    else:
-        rows = _check_inputs_of_user(inputs, system, axis)
-    return with_columns(system, rows, axis, steps)
-
-
-def inputs_of_other_shape(system: StateSpaceModel, found: Any) -> ModelError:
-    """The error for inputs with other columns than those of the system."""
-    return ModelError(
-        f"inputs must have shape (steps, {system.n_inputs}), a column for each of "
-        f"{list(system.inputs)}, got {found}"
-    )
-
-
-def _check_inputs_of_user(inputs: Any, system: StateSpaceModel, axis: TimeAxis) -> np.ndarray:
-    if inputs is None:
-        if system.n_inputs:
-            raise ModelError(
-                f"inputs must have a row per step and a column for each of {list(system.inputs)}, "
-                f"got None"
-            )
-        return np.zeros((0, 0))
-    if not system.n_inputs:
-        raise ModelError(
-            f"inputs must be None for a system without inputs, got {shortened(inputs)}; name them "
-            f"in the system (StateSpaceModel(inputs=[...]))"
-        )
-    array = table_of("inputs", inputs, system.inputs, "inputs")
-    if array.ndim != 2 or array.shape[1] != system.n_inputs:
-        raise inputs_of_other_shape(system, np.shape(inputs))
-    needed = n_input_rows(system, axis.steps)
-    if axis.starts is not None and len(array) not in (needed, axis.starts.size):
-        raise ModelError(
-            f"inputs must have times of their own (input_times=) where times are off the grid of "
-            f"steps, or a row for each of the {axis.starts.size - 1} steps between them, got "
-            f"{len(array)} rows"
-        )
-    if array.shape[0] < needed:
-        last_row = ", and the observation uses u" if system.observation_uses_inputs else ""
-        raise ModelError(
-            f"inputs must have at least {needed} rows, because the last observation is at step "
-            f"{axis.steps[-1]} (row k holds during step k{last_row}), got {array.shape[0]}"
-        )
-    return array
 
 
 def check_seed(name: str, seed: Any) -> np.ndarray:

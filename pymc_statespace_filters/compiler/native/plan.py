@@ -32,7 +32,7 @@ from .outcome_code import OutcomeCode
 class RecordSlots(NamedTuple):
     """Parameters (G, k), rows (J,) or (J, 3), data (J, p), inputs and starts, by address and size.
 
-    Rows of width 1 are the steps of a single record, rows of width 3 those of `system.panel`.
+    Rows of width 1 are the steps of a single record, rows of width 3 those of `system.record`.
     """
 
     theta: int = 0

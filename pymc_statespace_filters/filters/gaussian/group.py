@@ -43,7 +43,7 @@ class Way(NamedTuple):
 
 
 class Table(NamedTuple):
-    """The rows of all records, which are steps or as in `system.panel`; data, inputs, noises.
+    """The rows of all records, which are steps or as in `system.record`; data, inputs, noises.
 
     ``theta`` are the parameters that the functions take. ``noises`` has a row for each step, and
     ``x`` is an error of the start, where states are drawn. A record that goes on from earlier rows
