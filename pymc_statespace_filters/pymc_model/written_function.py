@@ -85,6 +85,18 @@ class _Run(NamedTuple):
     end: int | None = None
 
 
+class _Number(NamedTuple):
+    """A number that the scalar code reads.
+
+    An element of the input, or of the health or the gradient by the call, of this number, or the
+    sum of this number.
+    """
+
+    kind: str
+    number: int
+    element: int = 0
+
+
 class _Source(NamedTuple):
     """Where an argument of a filter comes from: an input, a constant, or numbers made before."""
 
@@ -98,14 +110,14 @@ class _Source(NamedTuple):
 class _Parts:
     """A graph in parts: arguments of filters, sums of their terms, and what is made of these.
 
-    Inputs of the expressions are named by what they are: an element of an input of the graph, a sum
-    of terms, or an element of the health of a filter or of its gradient.
+    ``numbers`` are the inputs of the expressions, by their names.
     """
 
     inputs: list[Variable]
     arrays: list[np.ndarray]
     arena: Arena = field(default_factory=Arena)
     known: dict[Variable, Any] = field(default_factory=dict)
+    numbers: dict[str, _Number] = field(default_factory=dict)
     filters: list[tuple[PlannedFunction, list[_Source]]] = field(default_factory=list)
     sums: list[_Run] = field(default_factory=list)
     holds: Value = True  # whether all checks of the graph do
@@ -140,13 +152,17 @@ class _Parts:
         array = self.arrays[i]
         if array.dtype != np.float64 or array.size > _MAX_ELEMENTS:
             raise NotUnrollableError("an input that is no short vector of numbers")
-        return self._named(f"input.{i}", array.shape)
+        return self._array_of("input", i, array.shape)
 
-    def _named(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
-        names = [self.arena.input(f"{name}.{k}") for k in range(int(np.prod(shape)))]
-        found = np.empty(len(names), dtype=object)
-        found[:] = names
+    def _array_of(self, kind: str, number: int, shape: tuple[int, ...]) -> np.ndarray:
+        found = np.empty(int(np.prod(shape)), dtype=object)
+        found[:] = [self._read(_Number(kind, number, k)) for k in range(found.size)]
         return found.reshape(shape)
+
+    def _read(self, number: _Number) -> Value:
+        name = ".".join(map(str, number))
+        self.numbers[name] = number
+        return self.arena.input(name)
 
     def _results(self, node: Apply) -> list[Any]:
         if isinstance(node.op, FilterOp):
@@ -191,7 +207,7 @@ class _Parts:
     def _sum(self, run: _Run) -> Value:
         if run not in self.sums:
             self.sums.append(run)
-        return self.arena.input(f"sum.{self.sums.index(run)}")
+        return self._read(_Number("sum", self.sums.index(run)))
 
     def _of_filter(self, node: Apply) -> list[Any]:
         with COMPILATION:
@@ -205,9 +221,9 @@ class _Parts:
         self.filters.append((planned, [self._source(variable) for variable in node.inputs]))
         results = {
             "terms": lambda: _Terms(number),
-            "health": lambda: self._named(f"health.{number}", (HEALTH_SIZE,)),
+            "health": lambda: self._array_of("health", number, (HEALTH_SIZE,)),
             "tape": lambda: _Tape(number),
-            "theta_bar": lambda: self._named(f"gradient.{number}", self._shape(node.inputs[0])),
+            "theta_bar": lambda: self._array_of("gradient", number, self._shape(node.inputs[0])),
         }
         return [results[name]() for name in names]
 
@@ -298,7 +314,7 @@ class WrittenFunction(NativeFunction):
         computed = [value for array in given if array is not None for value in array.flat]
         self._before = _Written.of("arguments", computed)
         self._after = _Written.of("density", [failed, *(v for r in results for v in r.flat)])
-        if any(not name.startswith("input.") for name in self._before.used):
+        if any(parts.numbers[name].kind != "input" for name in self._before.used):
             raise NotUnrollableError("a filter whose arguments depend on the result of another one")
         self._n_computed = len(computed)
         self._lock = Lock()
@@ -339,7 +355,7 @@ class WrittenFunction(NativeFunction):
         computed = np.zeros(self._n_computed)
         calls = self._bound(arrays, computed)
         given = [np.zeros(len(written.used)) for written in (self._before, self._after)]
-        places = _Places(arrays, calls, self._parts.sums)
+        places = _Places(arrays, calls, self._parts.sums, self._parts.numbers)
         lengths = {i: np.array([call.words[_LENGTH_LEFT]]) for i, call in enumerate(calls)}
         copies_before = [
             *places.seeds(self._parts.filters),
@@ -387,6 +403,7 @@ class _Places(NamedTuple):
     arrays: Sequence[np.ndarray]
     calls: Sequence[BoundCall]
     sums: Sequence[_Run]
+    numbers: Mapping[str, _Number]
 
     def seeds(self, filters: Sequence[tuple[PlannedFunction, list[_Source]]]) -> list[Copy]:
         """Copies of inputs that filters are given by value."""
@@ -419,13 +436,10 @@ class _Places(NamedTuple):
     def copies(self, names: Sequence[str], given: np.ndarray) -> list[Copy]:
         """Copies of single numbers to their places in front of the scalar code."""
         found = []
-        for i, name in enumerate(names):
-            kind, number, *element = name.split(".")
-            if kind == "sum":
-                continue
-            array = self._array(kind, int(number))
-            source = array.ctypes.data + WORD * int(element[0])
-            found.append(Copy(source, given.ctypes.data + WORD * i))
+        for i, (kind, number, element) in enumerate(map(self.numbers.__getitem__, names)):
+            if kind != "sum":
+                source = self._array(kind, number).ctypes.data + WORD * element
+                found.append(Copy(source, given.ctypes.data + WORD * i))
         return found
 
     def _array(self, kind: str, number: int) -> np.ndarray:
@@ -436,10 +450,9 @@ class _Places(NamedTuple):
     def sums_into(self, names: Sequence[str], given: np.ndarray) -> list[Sum]:
         """The sums of terms, to their places in front of the scalar code."""
         found = []
-        for i, name in enumerate(names):
-            kind, number, *_ = name.split(".")
+        for i, (kind, number, _) in enumerate(map(self.numbers.__getitem__, names)):
             if kind == "sum":
-                call, begin, end = self.sums[int(number)]
+                call, begin, end = self.sums[number]
                 terms = self.calls[call].results[0][begin:end]
                 found.append(Sum(terms.ctypes.data, terms.size, given.ctypes.data + WORD * i))
         return found
