@@ -126,22 +126,20 @@ def place_by(
             ),
             numbers, timing.inputs, input_times,
         )  # fmt: skip
+    nothing = [None] * len(numbers)
     changes = [np.empty(0)] * len(numbers) if timed is None else [one.changes() for one in timed]
-    if timing.steps is not None:
-        steps = check_each(check_steps, timing.steps)
-        given = [
-            TimesBetween(own, t0 + own * system.dt, t0, breaks)
-            for own, breaks in zip(steps, changes, strict=True)
-        ]
-    else:
-        assert timing.times is not None
-        times = check_each(
-            lambda g, own: _times_from(t0, own, system.dt, clock, g), numbers, timing.times
-        )
-        given = [
-            TimesBetween(None, own, t0, breaks) for own, breaks in zip(times, changes, strict=True)
-        ]
-    given = [_until_the_end(one) for one in given]
+
+    def between(g: int, steps: Any, times: Any, changes: np.ndarray) -> TimesBetween:
+        if steps is not None:
+            steps = check_steps(steps)
+            times = t0 + steps * system.dt
+        else:
+            times = _times_from(t0, times, system.dt, clock, g)
+        # Inputs may change before step 0 or after the last observation.
+        inside = (changes > t0) & (changes < times[-1])
+        return TimesBetween(steps, times, t0, changes[inside])
+
+    given = check_each(between, numbers, timing.steps or nothing, timing.times or nothing, changes)
     if not is_grid(given, system.dt):
         check_each(lambda g, one: check_takes(system, one, clock, g), numbers, given)
         system = system.at_any_times
@@ -174,12 +172,6 @@ def _times_from(t0: float, given: Any, dt: float, clock: Clock, record: int) -> 
 def _text(time: Any) -> str:
     """A time as a user reads it, a number or a date."""
     return str(time) if isinstance(time, np.datetime64) else f"{time:.15g}"
-
-
-def _until_the_end(given: TimesBetween) -> TimesBetween:
-    """The same without changes of the inputs before step 0 or after the last observation."""
-    inside = (given.breaks > given.t0) & (given.breaks < given.times[-1])
-    return given._replace(breaks=given.breaks[inside])
 
 
 def check_takes(system: StateSpaceModel, given: TimesBetween, clock: Clock, record: int) -> None:
