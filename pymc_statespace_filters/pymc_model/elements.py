@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
+from ..system.labels import element_label
 
 Columns = tuple[int, ...]
 
@@ -115,13 +116,9 @@ def labels_of(name: str, shape: tuple[int, ...], model: pm.Model) -> list[str]:
         range(n) if values is None or len(values) != n else np.asarray(pd.Index(values))
         for values, n in zip(coords, shape, strict=True)
     ]
-    labels = [_label(name, one) for one in product(*axes)]
+    labels = [element_label(name, one) for one in product(*axes)]
     return labels if len(set(labels)) == len(labels) else _positions(name, shape)
 
 
 def _positions(name: str, shape: tuple[int, ...]) -> list[str]:
-    return [_label(name, one) for one in np.ndindex(shape)]
-
-
-def _label(name: str, at: tuple[object, ...]) -> str:
-    return f"{name}[{', '.join(map(str, at))}]" if at else name
+    return [element_label(name, one) for one in np.ndindex(shape)]

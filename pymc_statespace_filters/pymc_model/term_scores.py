@@ -18,6 +18,7 @@ from ..filters.written import short_form
 from ..ops.base import evaluator
 from ..ops.likelihood import LogLikelihood
 from ..system.panel_records import FIRST_INPUT, RECORD, STEP, records_of, rows_of_copies
+from ..system.parameters import element_names
 from .at_points import GraphsAtPoints
 from .density import RowFunction, check_free_variables
 from .inspection import scored_rows, state_space_nodes
@@ -102,13 +103,7 @@ class ScoredVariable:
     @property
     def labels(self) -> list[str]:
         """The names of the elements of theta (k,)."""
-        return [
-            name + (f"[{', '.join(map(str, index))}]" if index else "")
-            for name, shape in zip(
-                self.system.parameters, self.system.parameter_shapes, strict=True
-            )
-            for index in np.ndindex(shape)
-        ]
+        return element_names(self.system)
 
     @property
     def act_after_start(self) -> NDArray[np.bool_]:

@@ -9,6 +9,7 @@ import numpy as np
 from ..errors import ModelError
 from .drift import DriftingParameter
 from .drift_processes import DriftProcess
+from .labels import element_label
 
 if TYPE_CHECKING:
     from .model import StateSpaceModel
@@ -109,7 +110,7 @@ def _drifting_parameters(
     indices = [index] if index else list(np.ndindex(shapes[parameter]))
     states = [
         DriftingParameter(
-            _name(parameter, each), parameter, each, process, laws, () if index else each
+            element_label(parameter, each), parameter, each, process, laws, () if index else each
         )
         for each in indices
     ]
@@ -140,10 +141,6 @@ def _place(key: str, shapes: Mapping[str, tuple[int, ...]]) -> tuple[str, tuple[
         f"{key} must be a parameter of the system, or an element of one such as b[2], got a system "
         f"with the parameters {list(shapes)}"
     )
-
-
-def _name(parameter: str, index: tuple[int, ...]) -> str:
-    return f"{parameter}[{', '.join(map(str, index))}]" if index else parameter
 
 
 def _check_names(system: "StateSpaceModel", found: list[DriftingParameter]) -> None:

@@ -16,6 +16,11 @@ def default_names(letter: str, n: int) -> list[str]:
     return [f"{letter}{i}" for i in range(n)]
 
 
+def element_label(name: str, index: Sequence[Any]) -> str:
+    """The name of an element of an array, such as "b[2]"; of a scalar, that of the scalar."""
+    return f"{name}[{', '.join(map(str, index))}]" if index else name
+
+
 def columns_in_order(name: str, value: Any, components: Sequence[str], role: str) -> Any:
     """The data ``value`` with one column for each component, aligned by label.
 

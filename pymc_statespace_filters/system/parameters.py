@@ -11,7 +11,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from ..errors import ModelError
 from .equations import RESERVED
-from .labels import rows_in_order
+from .labels import element_label, rows_in_order
 from .model import StateSpaceModel
 from .panel_records import Records
 from .record import Record
@@ -78,7 +78,7 @@ def known_elements(
 def element_names(system: StateSpaceModel) -> list[str]:
     """Names of the elements of flat parameters (k,), such as "k[0]"."""
     return [
-        name + (f"[{', '.join(map(str, index))}]" if index else "")
+        element_label(name, index)
         for name, shape in zip(system.parameters, system.parameter_shapes, strict=True)
         for index in np.ndindex(shape)
     ]
