@@ -130,14 +130,14 @@ def place_by(
     changes = [np.empty(0)] * len(numbers) if timed is None else [one.changes() for one in timed]
 
     def between(g: int, steps: Any, times: Any, changes: np.ndarray) -> TimesBetween:
-        if steps is not None:
-            steps = check_steps(steps)
-            times = t0 + steps * system.dt
+        if steps is None:
+            at = _times_from(t0, times, system.dt, clock, g)
         else:
-            times = _times_from(t0, times, system.dt, clock, g)
+            steps = check_steps(steps)
+            at = t0 + steps * system.dt
         # Inputs may change before step 0 or after the last observation.
-        inside = (changes > t0) & (changes < times[-1])
-        return TimesBetween(steps, times, t0, changes[inside])
+        inside = (changes > t0) & (changes < at[-1])
+        return TimesBetween(steps, at, t0, changes[inside])
 
     given = check_each(between, numbers, timing.steps or nothing, timing.times or nothing, changes)
     if not is_grid(given, system.dt):
