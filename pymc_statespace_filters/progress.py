@@ -55,11 +55,15 @@ def row_progress(work: ReportsRows, *, enabled: bool) -> Iterator[Callable[[str,
 
     Yields the function that begins a task, with its name and about how many rows it has.
     """
+    before = work.on_progress
     with ExitStack() as stack:
         bar = _RowProgress(stack)
         if enabled:
             work.on_progress = bar.advance
-        yield bar.begin if enabled else lambda task, total: None
+        try:
+            yield bar.begin if enabled else lambda task, total: None
+        finally:
+            work.on_progress = before  # what it does after the last task has no bar
         bar.begin("", 0)  # the last task is done
 
 

@@ -78,11 +78,13 @@ def check_convergence(posterior: Posterior, idata: xr.DataTree | None = None) ->
     poor = [v for v, one in zip(parameters, rhats, strict=True) if one > MAX_RHAT]
     effective = min(float(ess(v)) for v in poor)
     factor = max(2, math.ceil(ENOUGH_EFFECTIVE / max(effective, 1.0)))
-    how = f" (until_ess={ENOUGH_EFFECTIVE} of sample_dram)" if _drawn_by_us(idata) else ""
+    how = f"draws={factor * parameters.shape[-1]}"
+    if _drawn_by_us(idata):
+        how = f"until_ess={ENOUGH_EFFECTIVE} of sample_dram"
     yield (
-        f"{found}: their effective sample size is {effective:.0f}; about {factor} times as many "
-        f"draws would give {ENOUGH_EFFECTIVE}{how}. If R-hat stays above {MAX_RHAT}, start the "
-        "chains elsewhere (initvals) or tune longer"
+        f"{found}: their effective sample size is {effective:.0f}; {how} would give "
+        f"{ENOUGH_EFFECTIVE}, with about {factor} times as many iterations. If R-hat stays above "
+        f"{MAX_RHAT}, start the chains elsewhere (initvals) or tune longer"
     )
 
 

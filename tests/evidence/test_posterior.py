@@ -200,12 +200,14 @@ def test_chains_that_disagree_are_told_how_many_more_draws_would_do():
     (doubt,) = check_convergence(posterior)
     ess = float(az.ess(posterior.draws[..., 0]))
     assert 5 < ess < 50
-    assert f"effective sample size is {ess:.0f}; about {math.ceil(400 / ess)} times as" in doubt
+    factor = math.ceil(400 / ess)
+    assert f"sample size is {ess:.0f}; draws={factor * posterior.draws.shape[1]} would" in doubt
+    assert f"about {factor} times as many iterations" in doubt
     assert "until_ess" not in doubt
     drawn_by_dram = xr.DataTree()
     drawn_by_dram.attrs["refresh_noise"] = 1
     (doubt,) = check_convergence(posterior, drawn_by_dram)
-    assert "would give 400 (until_ess=400 of sample_dram)" in doubt
+    assert "until_ess=400 of sample_dram would give 400" in doubt
     assert not list(check_convergence(normal_chains(0.0)))
 
 

@@ -147,7 +147,7 @@ def test_bars_of_chains_begin_with_the_first_iteration_and_end_with_the_last(upd
 @pytest.mark.usefixtures("interpreted")
 def test_bars_of_nuts_end_with_the_last_iteration(updates, monkeypatch, capfd):
     """nutpie may have said for the last time that 94 % are done."""
-    late = [SimpleNamespace(finished_draws=17, divergences=0)] * 2
+    late = [SimpleNamespace(finished_draws=17, divergences=0, total_num_steps=9)] * 2
     monkeypatch.setattr(chains._Watch, "__call__", lambda watch, _: setattr(watch, "chains", late))
     settings = {"sampler": "nuts", "until_ess": None, "initvals": {"mu": 0.5}}
     psf.sample(10, tune=8, chains=2, model=model(), **settings)
@@ -164,6 +164,17 @@ def test_a_row_that_was_an_estimate_is_whole_at_the_end(monkeypatch):
         begin("a part", 100)
         work.on_progress(94)
     assert [bar.tasks[0].percentage for bar in shown] == [100.0]
+
+
+def test_work_after_the_last_task_has_no_bar(monkeypatch):
+    counts = []
+    work = SimpleNamespace(on_progress=counts.append)
+    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    monkeypatch.setattr(progress._RowProgress, "_show", lambda bar: pytest.fail(bar._task))
+    with progress.row_progress(work, enabled=True):
+        pass
+    work.on_progress(5)
+    assert counts == [5]
 
 
 def screen():
