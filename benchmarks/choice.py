@@ -1,7 +1,7 @@
-"""Is the choice of `psf.sample` right? Both samplers on each posterior, and what is chosen.
+"""What does the race of `psf.sample` cost? Both samplers on each posterior, and the race.
 
 ``python -m benchmarks.choice`` prints a row for each posterior: CPU seconds until ``until_ess=400``
-is reached, compilation and starts included, effective draws per CPU second, and the choice. Names
+is reached, compilation and starts included, effective draws per CPU second, and the outcome. Names
 on the command line choose posteriors by their beginnings. Each run has a process of its own, so
 that none finds machine code that another one has loaded.
 """
@@ -18,7 +18,7 @@ from arviz_stats.base import array_stats
 import pymc_statespace_filters as psf
 from benchmarks.hard_posteriors import HARD
 from benchmarks.posteriors import POSTERIORS
-from pymc_statespace_filters.sampling.choice import choose_sampler, why_no_nuts
+from pymc_statespace_filters.sampling.choice import why_no_nuts
 
 ALL = POSTERIORS | HARD
 MOST_SECONDS = 600
@@ -43,14 +43,14 @@ def run(name: str, sampler: str) -> dict:
     idata = psf.sample(model=model, sampler=sampler, random_seed=1, progressbar=False)
     seconds = time.process_time() - began
     ess = least_ess(idata["posterior"])
-    return {"seconds": seconds, "ess": ess, "thin": idata.attrs["iterations_per_draw"]}
+    thin, reason = idata.attrs["iterations_per_draw"], idata.attrs["sampler_reason"]
+    return {"seconds": seconds, "ess": ess, "thin": thin, "reason": reason}
 
 
 def row(name: str) -> str:
     """A row of the table."""
-    model = ALL[name]()
-    chosen, found = choose_sampler(model, 4, 1000), {}
-    for sampler in ("dram",) if why_no_nuts(model) else ("dram", "nuts"):
+    model, found = ALL[name](), {}
+    for sampler in ("dram",) if why_no_nuts(model) else ("dram", "nuts", "auto"):
         command = [sys.executable, "-m", "benchmarks.choice", "--run", name, sampler]
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=MOST_SECONDS)
@@ -60,16 +60,17 @@ def row(name: str) -> str:
     cells = [
         "-" if (one := found.get(sampler)) is None
         else f"{one['seconds']:.1f} s, {one['ess'] / one['seconds']:.1f}, k = {one['thin']}"
-        for sampler in ("dram", "nuts")
+        for sampler in ("dram", "nuts", "auto")
     ]  # fmt: skip
-    return f"| {name} | {' | '.join(cells)} | {chosen.sampler} | {chosen.reason} |"
+    raced = found.get("auto")
+    return f"| {name} | {' | '.join(cells)} | {'-' if raced is None else raced['reason']} |"
 
 
 def main() -> None:
     if sys.argv[1:2] == ["--run"]:
         print(json.dumps(run(*sys.argv[2:4])))
         return
-    print("| posterior | DRAM: CPU, ESS per CPU second | NUTS | chosen | because |")
+    print("| posterior | DRAM: CPU, ESS per CPU second | NUTS | race | how it went |")
     print("| --- " * 5 + "|")
     for name in ALL:
         if not sys.argv[1:] or any(name.startswith(begin) for begin in sys.argv[1:]):

@@ -13,6 +13,7 @@ from . import missed as missed
 from . import mobility as mobility
 from . import modes as modes
 from . import noise as noise
+from . import raced as raced
 from . import refusals as refusals
 from .words import sentences, tell
 

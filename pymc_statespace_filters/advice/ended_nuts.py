@@ -5,7 +5,6 @@ import numpy as np
 from ..checks.filters.filter_facts import UsedFilters
 from ..parallel.signals import is_interrupted
 from ..pymc_model.missing_codes import has_missing_codes
-from ..sampling.nuts.chains import TOLERATED
 from ..sampling.output.convergence import MAX_RHAT
 from ..sampling.output.facts import EndedNuts
 from .filter_check import check_filters
@@ -45,7 +44,7 @@ def _too_short(fact: EndedNuts, instead: str) -> list[str]:
     """Draws that are worth less than was asked for."""
 
     def ways(slowest: str) -> list[str]:
-        return [instead] if instead else ["use sampler='dram'", f"reparametrise {slowest}"]
+        return [instead or f"reparametrise {slowest}"]
 
     remedy = ""
     if fact.is_stuck:
@@ -71,17 +70,16 @@ def _report(fact: EndedNuts) -> str:
 
 def _problems(fact: EndedNuts, instead: str) -> list[str]:
     diverging, e_bfmi = fact.diverging, _e_bfmi(fact)
-    if diverging.mean() > TOLERATED:
+    if fact.diverges:
         return [
             f"{int(diverging.sum())} of {diverging.size} draws diverged, most where "
             f"{_neck(fact)}: "
-            f"{instead or "reparametrise that variable, or use sampler='dram'"}."
+            f"{instead or 'reparametrise that variable'}."
         ]
     if e_bfmi.min() < _LEAST_E_BFMI:
         return [
             f"E-BFMI is {e_bfmi.min():.2f} in chain {int(e_bfmi.argmin())}: the chains are slow "
-            f"along the log-density, as of {_neck(fact)}; reparametrise it, or use "
-            "sampler='dram'."
+            f"along the log-density, as of {_neck(fact)}; reparametrise it."
         ]
     return []
 

@@ -69,7 +69,7 @@ def _remedy(fact: EndedRun, enough: float, ways: Sequence[str]) -> str:
         more = "draw more with psf.sample(draws=..., until_ess=None), which has no limit of time"
     return (
         f"{would_do}the run ended as twice as many would take longer than its "
-        f"{request.seconds:.0f} s: {alternatives([more, *ways])}"
+        f"{request.seconds:.0f} CPU s: {alternatives([more, *ways])}"
     )
 
 
@@ -77,12 +77,12 @@ def _needed(fact: EndedRun, found: Convergence, enough: float) -> str:
     """How many iterations would do, and what they take."""
     factor = max(1.0, enough / max(found.least_ess, 1.0))
     return (
-        f"About {_rounded(factor * fact.length.n_iterations)} iterations of each chain would do, "
+        f"About {rounded(factor * fact.length.n_iterations)} iterations of each chain would do, "
         f"in {_duration(factor * fact.seconds)}"
     )
 
 
-def _rounded(number: float) -> str:
+def rounded(number: float) -> str:
     """A number with two digits, without an exponent."""
     return f"{float(f'{number:.1e}'):.0f}"
 

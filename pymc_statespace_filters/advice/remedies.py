@@ -10,7 +10,7 @@ from pytensor.graph.traversal import ancestors
 from scipy.stats import skew
 
 from ..checks.coverage import ALL_MODES
-from ..pymc_model.inspection import gradient_obstacle, kinked_variable, noisy_filters
+from ..pymc_model.inspection import noisy_filters
 
 # A posterior reaches zero if at least this share of the draws is below a tenth of the mean, and if
 # logarithms have this skewness: -1.1 with the exponential distribution, -1.5 with the half-normal,
@@ -18,6 +18,7 @@ from ..pymc_model.inspection import gradient_obstacle, kinked_variable, noisy_fi
 _LEAST_SHARE, _MOST_SKEWNESS = 0.01, -1.0
 _LEAST_SIDE, _GAP = 0.02, 0.2  # of the draws, beside a gap; of their range without the ends
 _LEAST_CORRELATION = 0.5  # with another parameter, that can make up for it
+_TOGETHER, _MOST_NAMED = 0.75, 8  # correlation of those that move together
 
 Array = NDArray[np.float64]
 
@@ -37,20 +38,37 @@ def ways_to_mix(model: Model, names: Sequence[str], positions: Array, slowest: s
     elif (name := reaches_zero(model, names, positions)) is not None:
         ways = [without_transform(name)]
     else:
-        ways = ["tune longer"]
-        if not gradient_obstacle(model) and kinked_variable(model) is None:
-            ways.append("use psf.sample(sampler='nuts')")
-        ways.append(f"reparametrise {slowest}")
+        ways = ["tune longer", reparametrise(names, positions, slowest)]
     if noisy_filters(model):
         ways.insert(-1, "give the filter more particles (psf.suggest_particles)")
     return ways
+
+
+def reparametrise(names: Sequence[str], positions: Array, slowest: str) -> str:
+    """What to do about the slowest element: with those that move along with it, if there are any.
+
+    As where data know a ratio alone: any of its parts may be the slowest.
+    """
+    i = list(names).index(slowest)
+    with np.errstate(invalid="ignore", divide="ignore"):  # an element that has not moved
+        sizes = np.abs(np.corrcoef(positions, rowvar=False).reshape(len(names), -1)[i])
+    together = [j for j in np.argsort(-sizes, kind="stable") if sizes[j] > _TOGETHER]
+    if len(together) < 2:
+        return f"reparametrise {slowest}"
+    *firsts, last = [names[j] for j in sorted(together[:_MOST_NAMED])]
+    others = sizes[together[1:]]
+    return (
+        f"fix one of {', '.join(firsts)} and {last}, which move together (correlations of "
+        f"{others.min():.2f} to {others.max():.2f} with {slowest}), or write the others relative "
+        "to it"
+    )
 
 
 def without_transform(name: str) -> str:
     """What to do with a variable that reaches zero."""
     return (
         f"sample {name} as it is, whose logarithm has a long tail as its posterior reaches zero "
-        "(default_transform=None, sampler='dram')"
+        "(default_transform=None)"
     )
 
 

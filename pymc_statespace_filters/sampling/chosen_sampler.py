@@ -11,23 +11,24 @@ from pymc.model import Model
 from xarray import DataTree
 
 from ..errors import ModelError
+from ..parallel.cpu_affinity import available_cores
 from ..parallel.signals import keeps_what_is_there
 from ..pymc_model.density import check_free_variables
 from ..pymc_model.inspection import given_model
 from .checkpoint.checkpoint import checked_folder
-from .choice import DRAM, NUTS, Choice, choose_sampler, why_no_nuts
+from .choice import BOTH, DRAM, MOST_THIN, NUTS, Choice, why_dram, why_no_nuts
+from .output.convergence import FEWEST
 from .output.facts import of_model
+from .race import race
 from .run.continuation import appended, former_chains
 from .run.driver import sample_models
 from .run.request import RunArguments, SamplingRequest
 from .run.stopping import AUTO, target_ess
 
 _SAMPLERS = ("auto", NUTS, DRAM)
-_NAMES = {DRAM: "DRAM", NUTS: "NUTS"}
-# Seconds within which chains go on to reach ``until_ess``.
+_NAMES = {DRAM: "DRAM", NUTS: "NUTS", BOTH: "DRAM, then NUTS from its points"}
+# CPU seconds of each processor, within which chains go on to reach ``until_ess``.
 TIME_LIMIT = 300.0
-# Iterations of each chain at most, in draws, unless ``max_draws`` says so.
-_MOST_THIN = {DRAM: 1024, NUTS: 64}
 
 _log = logging.getLogger("pymc.sampling.psf")
 
@@ -52,9 +53,11 @@ def sample(
 ) -> DataTree | None:
     """Draw from the posterior of a model, by the sampler that suits it.
 
-    That is NUTS (of nutpie) where every likelihood has a gradient and the posterior has so many
-    parameters that gradients pay, and else the random walk of `sample_dram`. A line of the log
-    says which, and why. Both start in the posterior, found as by `find_starts`.
+    The random walk of `sample_dram` runs first, from points found as by `find_starts`. Where its
+    draws would take more than 32 ``draws`` iterations of each chain to be worth enough, and every
+    likelihood has a gradient, NUTS (of nutpie) starts at its points. Where NUTS takes more
+    evaluations than the walk would, or diverges, the walk goes on from the draws of NUTS. The
+    report says what was tried, and what came of it.
 
     A draw is the last of k iterations. First k is 1; it is doubled, and every second draw dropped,
     until the draws are worth ``until_ess``. The result has the size of ``draws``, however slowly
@@ -64,7 +67,7 @@ def sample(
     ----------
     draws, tune : int
         Draws of each chain that are kept, and iterations of its warm-up, which are not. NUTS needs
-        a warm-up.
+        a warm-up; in the race, where it has the scales of the walk's points, a third of ``tune``.
     model : pymc.Model, optional
         Default: the model of the ``with`` block. Its free variables must be continuous.
     until_ess : float or "auto", optional
@@ -74,13 +77,14 @@ def sample(
     max_draws : int, optional
         Iterations of each chain at most. Default: 1024 times ``draws`` with the random walk, 64
         times with NUTS. The run also ends where the next doubling would take it beyond five
-        minutes, or where chains of NUTS diverge and the last doubling has made them worth little
-        more; a warning says what would do. Apart from the limit of time, the result depends on
-        ``random_seed`` and the number of chains alone.
+        minutes of the time of each of its processors, or where chains of NUTS diverge and the last
+        doubling has made them worth little more; a warning says what would do. Apart from the limit
+        of time, the result and the sampler depend on ``random_seed`` and the number of chains
+        alone: the race counts evaluations.
     chains, cores : int
         Number of chains, and of those that run at a time. Default: as many as there are processors.
     sampler : {"auto", "nuts", "dram"}
-        The sampler, if it is not to be chosen.
+        The sampler, if there is to be no race.
     kernel : mapping of str to object, optional
         Settings of the random walk, as in `sample_dram`; with them it is the sampler.
     continue_from : xarray.DataTree, optional
@@ -156,7 +160,7 @@ def sample_named(
         "checkpoint": checkpoint,
         "comm": comm,
     }
-    choice = _choice(model, sampler, only_dram, chains=given.chains, tune=given.tune)
+    choice = _choice(model, sampler, only_dram, given)
     request = _request(choice.sampler, given)
     if continue_from is not None:
         request = _continued(request, continue_from, model)
@@ -164,7 +168,10 @@ def sample_named(
     _log.log(level, "%s%s: %s", of_model(name), _NAMES[choice.sampler], choice.reason)
     options = given.options(comm)
     tree: DataTree | None
-    if choice.sampler == NUTS:
+    if choice.sampler == BOTH:
+        goal = request.until_ess or target_ess(AUTO, given.draws, given.chains)
+        tree, choice = race(model, request, goal, options, name)
+    elif choice.sampler == NUTS:
         from .nuts.sample_nuts import sample_nuts  # nutpie takes longer to import than the rest
 
         tree = sample_nuts(model, request, options, name)
@@ -180,7 +187,7 @@ def sample_named(
 
 
 def _choice(
-    model: Model, sampler: Any, only_dram: Mapping[str, Any], *, chains: int, tune: int
+    model: Model, sampler: Any, only_dram: Mapping[str, Any], given: RunArguments
 ) -> Choice:
     """The sampler that the user has named, or that the model and the arguments ask for."""
     if sampler not in _SAMPLERS:
@@ -191,15 +198,18 @@ def _choice(
             raise ModelError(f"{asked[0]} must be None with sampler='nuts': sampler='dram' has it")
         if reason := why_no_nuts(model):
             raise ModelError(f"sampler must be 'dram' for this model, got 'nuts': {reason}")
-        if tune == 0:
+        if given.tune == 0:
             raise ModelError("tune must be at least 1 with sampler='nuts', got 0")
     if sampler != "auto":
         return Choice(sampler, f"sampler={sampler!r}")
     if asked:
         return Choice(DRAM, f"NUTS has no {asked[0]}")
-    if tune == 0:
+    if given.tune == 0:
         return Choice(DRAM, "NUTS needs a warm-up, and tune is 0")
-    return choose_sampler(model, chains, tune)
+    if given.draws < FEWEST:
+        return Choice(DRAM, "so few draws do not show what they are worth")
+    reason = why_dram(model)
+    return Choice(DRAM, reason) if reason else Choice(BOTH, "if it takes too many iterations")
 
 
 def _request(sampler: str, given: RunArguments) -> SamplingRequest:
@@ -207,8 +217,9 @@ def _request(sampler: str, given: RunArguments) -> SamplingRequest:
     request = replace(given, until_ess=until_ess).request()
     if until_ess is None:
         return request
-    most = given.max_draws or _MOST_THIN[sampler] * given.draws
-    return request._replace(max_draws=most, doubles_thin=True, seconds=TIME_LIMIT)
+    most = given.max_draws or MOST_THIN[sampler] * given.draws
+    seconds = TIME_LIMIT * min(given.chains, given.cores or available_cores())
+    return request._replace(max_draws=most, doubles_thin=True, seconds=seconds)
 
 
 def _continued(request: SamplingRequest, idata: DataTree, model: Model) -> SamplingRequest:

@@ -68,7 +68,7 @@ def test_the_advice():
     )
     model, names, positions = drawn(5 + NORMAL)
     assert alternatives(ways_to_mix(model, names, positions, "other")) == (
-        "tune longer, use psf.sample(sampler='nuts'), or reparametrise other"
+        "tune longer, or reparametrise other"
     )
 
 

@@ -117,7 +117,7 @@ def test_a_funnel_ends_the_run_at_the_first_doubling_that_does_not_help(caplog):
 
     assert 2 <= tree.attrs["iterations_per_draw"] <= 8  # of 64
     assert "draws diverged, most where tau is small" in caplog.text
-    assert "More iterations do not help draws that diverge: use sampler='dram'" in caplog.text
+    assert "More iterations do not help draws that diverge: reparametrise tau" in caplog.text
     assert "would do" not in caplog.text  # no number of iterations does
 
 

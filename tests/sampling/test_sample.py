@@ -68,7 +68,7 @@ def test_a_draw_is_the_last_of_k_iterations(every_iteration):
     draws = 51
     call = {"model": simple_model(), "chains": 2, "tune": 100, **QUIET}
     thinned = psf.sample_dram(draws, thin=4, **call)
-    doubled = sample(draws, until_ess=2 * draws, max_draws=4 * draws + 1, **call)
+    doubled = sample(draws, sampler="dram", until_ess=2 * draws, max_draws=4 * draws + 1, **call)
     whole = every_iteration["sample_stats"].isel(draw=slice(0, 4 * draws))
     for name, values in every_iteration["posterior"].data_vars.items():
         np.testing.assert_array_equal(thinned["posterior"][name], values[:, 3 : 4 * draws : 4])
@@ -102,7 +102,7 @@ def test_a_doubled_run_resumes_with_the_same_bits(tmp_path, monkeypatch, n_parts
     from pymc_statespace_filters.sampling.run import chain_task
 
     call = {"model": simple_model(), "chains": 2, "tune": 40, "cores": 1, **QUIET}
-    call |= {"draws": 25, "until_ess": 50, "max_draws": 200}
+    call |= {"draws": 25, "sampler": "dram", "until_ess": 50, "max_draws": 200}
     expected = sample(**call)
     monkeypatch.setattr(chain_task, "CHECKPOINT_SECONDS", 0.0)
     made = []
@@ -143,7 +143,7 @@ def test_a_run_ends_as_soon_as_its_draws_are_worth_enough():
 def test_the_end_of_a_run_that_reached_nothing(caplog):
     """By its iterations, and by its time, with what would do."""
     call = {"model": simple_model(), "tune": 100, **QUIET}
-    sample(50, until_ess=100, max_draws=100, **call)
+    sample(50, sampler="dram", until_ess=100, max_draws=100, **call)
     assert "was not reached with 100 iterations" in caplog.text
     assert "iterations of each chain would do" in caplog.text
     assert "larger max_draws than 100" in caplog.text
@@ -154,7 +154,7 @@ def test_the_end_of_a_run_that_reached_nothing(caplog):
     [(100, 1, "Give more draws"), (50, 4, "Give more draws"), (1, 1, "")],
 )
 def test_few_draws_are_asked_for_what_they_can_show(draws, chains, said, caplog):
-    tree = sample(draws, 100, model=simple_model(), chains=chains, **QUIET)
+    tree = sample(draws, 100, sampler="dram", model=simple_model(), chains=chains, **QUIET)
     assert tree.attrs["iterations_per_draw"] <= 64
     assert said in caplog.text
     assert "hardly moves" not in caplog.text
@@ -163,7 +163,8 @@ def test_few_draws_are_asked_for_what_they_can_show(draws, chains, said, caplog)
 
 def test_more_than_the_draws_show(caplog):
     """Half of them and more is allowed, and the advice is the only one that works."""
-    sample(30, 100, model=simple_model(), chains=2, until_ess=59, max_draws=30, **QUIET)
+    call = {"until_ess": 59, "max_draws": 30, "sampler": "dram"}
+    sample(30, 100, model=simple_model(), chains=2, **call, **QUIET)
     assert "Give more draws: 2 * 30 hardly show so many" in caplog.text
     assert "would do" not in caplog.text
 
@@ -204,22 +205,9 @@ def test_the_choice():
     assert "noise" in choice.why_no_nuts(linear_model(3, psf.BootstrapPF(10)))
     assert "no gradient" in choice.why_no_nuts(linear_model(3, psf.GridFilter()))
     assert sample(5, 0, model=linear_model(3), **QUIET).attrs["sampler"] == "dram"
-    kinked = choice.choose_sampler(linear_model(200, kink=True), 4, 1000)
-    assert kinked == ("dram", "the equations of 'd' have kinks or jumps")
-    few, many = (choice.choose_sampler(linear_model(n), 4, 1000) for n in (3, 200))
-    assert (few.sampler, many.sampler) == ("dram", "nuts")
-    assert few.reason.startswith("3 parameters, ")
-
-
-def test_what_decides_is_the_dimension_and_the_cost():
-    def better(dim, cost):
-        return choice.expected_seconds("dram", dim, cost, 4, 1000) > choice.expected_seconds(
-            "nuts", dim, cost, 4, 1000
-        )
-
-    assert not any(better(dim, cost) for dim in (1, 5, 8) for cost in (1e-6, 1e-4, 1e-2))
-    assert all(better(dim, cost) for dim in (15, 40) for cost in (1e-4, 1e-2))
-    assert not better(30, 1e-6)  # less than the gradient takes to compile
+    assert choice.why_dram(linear_model(3)) == ""
+    kinked = choice.why_dram(linear_model(200, kink=True))
+    assert kinked == "the equations of 'd' have kinks or jumps"
 
 
 @pytest.fixture(scope="module", params=["noise", "records"])

@@ -1,6 +1,7 @@
 """Chains of nutpie, looked at while they run, until their draws are worth enough."""
 
 import time
+import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from threading import Semaphore
@@ -15,8 +16,10 @@ from xarray import DataTree
 from ...parallel.signals import interrupts_are_noted, takes_interrupt
 from ..output.chain_bars import ChainProgress
 from ..output.convergence import Convergence, convergence
+from ..output.facts import TOLERATED
 from ..run.request import SamplingRequest
 from ..run.stopping import Length, first_length, next_length
+from .frame import Frame
 from .gradient import DensityGradient
 
 Array = NDArray[np.float64]
@@ -33,9 +36,9 @@ STATISTICS = {
     "mean_tree_accept": "acceptance_rate",
 }
 _SECONDS = 0.05
-# Share of the draws that may diverge without a word. Beyond it chains go on only as long as a
-# doubling of their iterations, which should double the effective draws, raises them so much.
-TOLERATED, _LEAST_GROWTH = 0.001, 1.25
+# Chains that diverge go on only as long as a doubling of their iterations, which should double the
+# effective draws, raises them so much.
+_LEAST_GROWTH = 1.25
 
 
 class NutsChains(NamedTuple):
@@ -48,26 +51,30 @@ class NutsChains(NamedTuple):
     seconds: float
     is_stuck: bool  # whether they diverged, and ended as more iterations had not helped
     is_complete: bool  # whether they have made as many iterations as they were to
+    n_gradients: int  # with those of the warm-up
+    is_beaten: bool = False  # whether they ended as they take more gradients than they may
 
 
 def run_nuts(
     density: DensityGradient,
-    start: Callable[[np.random.Generator], Array],
-    dim: int,
+    points: Array,
+    frame: Frame,
     request: SamplingRequest,
     *,
     cores: int,
     seed: int,
     progressbar: bool | str,
+    most_gradients: float = np.inf,
 ) -> NutsChains:
-    """Run the chains of a request, each from ``start`` with a generator of its own.
+    """Run the chains of a request in the coordinates of a frame, each from one of m points (m, d).
 
-    Ctrl-C ends them; the draws that all have made are kept.
+    They end where they are seen to take more gradients than the most. Ctrl-C ends them; the draws
+    that all have made are kept.
     """
     allowed = Semaphore(cores)
 
     def evaluate_in_turn() -> Callable[[Array], tuple[float, Array]]:
-        evaluate = density.for_a_thread()
+        evaluate = frame.within(density.for_a_thread())
 
         def waiting(x: Array) -> tuple[float, Array]:
             with allowed:
@@ -75,16 +82,19 @@ def run_nuts(
 
         return waiting
 
+    dim = len(frame.centre)
     model = from_pyfunc(
         dim,
         evaluate_in_turn,
-        lambda *_: lambda x: {"position": x.copy()},
+        lambda *_: lambda z: {"position": frame.positions(z)},
         [np.dtype(np.float64)],
         [(dim,)],
         ["position"],
-        make_initial_point_fn=lambda seed: start(np.random.default_rng(seed)),
+        make_initial_point_fn=lambda seed: frame.coordinates(
+            points[np.random.default_rng(seed).integers(len(points))]
+        ),
     )
-    began = time.monotonic()
+    began = time.monotonic(), time.process_time()
     interrupts_are_noted()
     with ChainProgress(request.chains, request.draws, request.tune, progressbar) as bars:
         sampler = nutpie.sample(
@@ -96,11 +106,11 @@ def run_nuts(
             seed=seed,
             progress_bar=False,
             progress_rate=50,
-            adaptation="low_rank",  # no worse than whitened by the starts
+            adaptation=frame.adaptation,
             blocking=False,
             progress_callback=(watch := _Watch()),
         )
-        return _followed(sampler, watch, request, bars, began)
+        return _followed(sampler, watch, request, bars, began, most_gradients)
 
 
 class _Watch:
@@ -114,17 +124,26 @@ class _Watch:
 
 
 def _followed(
-    sampler: Any, watch: _Watch, request: SamplingRequest, bars: ChainProgress, began: float
+    sampler: Any,
+    watch: _Watch,
+    request: SamplingRequest,
+    bars: ChainProgress,
+    began: tuple[float, float],
+    most_gradients: float,
 ) -> NutsChains:
     """Wait for the chains, and end them at the first length whose draws are worth enough."""
-    length, found, is_stuck = first_length(request), None, False
+    length, found, is_stuck, is_beaten = first_length(request), None, False, False
     while not takes_interrupt():
         time.sleep(_SECONDS)
         made = [chain.finished_draws for chain in watch.chains]
         for i, chain in enumerate(watch.chains):
             bars.update(i, chain.finished_draws, _shown(chain))
         is_over = _is_finished(sampler)
-        if not is_over and (not made or min(made) < request.tune + length.n_iterations):
+        due = request.tune + length.n_iterations
+        is_beaten = _gradients_within(watch.chains, due) > most_gradients
+        if is_beaten:
+            break
+        if not is_over and (not made or min(made) < due):
             continue
         for i, chain in enumerate(watch.chains):  # which may be what was said before the end
             bars.update(i, request.tune + length.n_iterations, _shown(chain))
@@ -132,20 +151,27 @@ def _followed(
         positions = _positions(trace)
         rows = slice(length.thin - 1, length.n_iterations, length.thin)
         before, found = found, convergence(list(positions[:, rows]))
-        longer = next_length(request, length, found, time.monotonic() - began)
+        longer = next_length(request, length, found, time.process_time() - began[1])
         is_stuck = longer is not None and _is_stuck(trace, rows, before, found)
-        if is_stuck or longer is None:
+        is_beaten = longer is not None and _n_gradients(trace, rows.stop) > most_gradients
+        if is_stuck or is_beaten or longer is None:
             break
         if is_over and _n_made(positions) < longer.n_iterations:
             break
         length = longer
         for i in range(request.chains):
             bars.extend(i, request.tune + length.n_iterations)
-    seconds = time.monotonic() - began
-    kept = _kept(sampler.abort(), length, found, seconds)._replace(is_stuck=is_stuck)
+    seconds = time.monotonic() - began[0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # ArviZ doubts fewer draws than chains
+        trace = sampler.abort()
+    kept = _kept(trace, length, found, seconds)
+    kept = kept._replace(is_stuck=is_stuck, is_beaten=is_beaten)
     made = kept.positions.shape[1]
     if made == length.draws:
         return kept
+    if is_beaten:  # before its draws were looked at
+        return kept._replace(found=None)
     found = convergence(list(kept.positions))
     return kept._replace(length=length._replace(draws=made), found=found, is_complete=False)
 
@@ -173,6 +199,22 @@ def _is_stuck(
     return bool(diverging.mean() > TOLERATED)
 
 
+def _gradients_within(chains: list[Any], n_iterations: int) -> int:
+    """Gradients so far of the chains that have made no more iterations than these.
+
+    Those of later ones depend on when they are counted.
+    """
+    return sum(c.total_num_steps for c in chains if c.finished_draws <= n_iterations)
+
+
+def _n_gradients(trace: DataTree, n_iterations: int) -> int:
+    """Gradients of the warm-up and of so many iterations after it; NaN where a chain has none."""
+    of_warm_up, of_draws = (
+        trace[group].dataset["n_steps"].values for group in ("warmup_sample_stats", "sample_stats")
+    )
+    return int(np.nansum(of_warm_up) + np.nansum(of_draws[:, :n_iterations]))
+
+
 def _positions(trace: DataTree) -> Array:
     return np.asarray(trace["posterior"].dataset["position"])
 
@@ -192,5 +234,12 @@ def _kept(trace: DataTree, length: Length, found: Convergence | None, seconds: f
         kept: stats[name].values[:, rows] for name, kept in STATISTICS.items() if name in stats
     }
     return NutsChains(
-        positions[:, rows], statistics, length, found, seconds, is_stuck=False, is_complete=True
+        positions[:, rows],
+        statistics,
+        length,
+        found,
+        seconds,
+        is_stuck=False,
+        is_complete=True,
+        n_gradients=_n_gradients(trace, rows.stop),
     )

@@ -1,6 +1,6 @@
 """A whole run of NUTS, from the request to the DataTree."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,44 +17,61 @@ from ...pymc_model.inspection import exactness, filters_used
 from ..output.datatree import to_datatree
 from ..output.facts import EndedNuts, SeparateModes, of_model
 from ..run.request import ExecutionOptions, SamplingRequest
+from ..starts.local_scale import local_cov
 from ..starts.population import find_population
 from ..target.initial_points import check_initvals
 from ..target.settings import RandomWalkSettings
 from ..target.target import Target
 from ..target.variables import check_no_generators
 from .chains import NutsChains, run_nuts
+from .frame import Frame, WithGradient, frame_of
 from .gradient import DensityGradient
 
 Array = NDArray[np.float64]
 
-_OFF_LEVEL = 1e-3  # how far from a user's point, where the density is level there
+# How far chains start from a user's point, in its scales: at a mode nutpie would know none.
+_OFF_MODE = 0.1
+_N_POINTS = 256  # around it, of which each chain takes one
 
 
 @keeps_what_is_there
 def sample_nuts(
-    model: Model, request: SamplingRequest, options: ExecutionOptions, name: str
+    model: Model,
+    request: SamplingRequest,
+    options: ExecutionOptions,
+    name: str,
+    points: Array | None = None,
+    most_gradients: float = np.inf,
 ) -> DataTree:
-    """Draw from the posterior by nutpie; errors are those of `sample`, messages have the name."""
+    """Draw from the posterior by nutpie; errors are those of `sample`, messages have the name.
+
+    Chains start among ``points`` (m, d) of the posterior, if there are any.
+    """
     options.check()
     check_no_generators(model)
     _check_initvals(model, request)
-    progressbar = options.progressbar
     rng = np.random.default_rng(request.entropy)
     target = Target(model, None, RandomWalkSettings())
     density = DensityGradient(model, target.raveled)
-    start = _start(model, target, density, request, rng, name, progressbar=bool(progressbar))
+    evaluate = density.for_a_thread()
+    if points is None:
+        points, frame = _starts(target, evaluate, request, rng, options, of_model(name))
+    else:
+        frame = frame_of(points, evaluate)
     chains = run_nuts(
         density,
-        start,
-        target.raveled.dim,
+        points,
+        frame,
         request,
         cores=options.cores or available_cores(),
         seed=int(rng.integers(2**32)),
-        progressbar=progressbar,
+        progressbar=options.progressbar,
+        most_gradients=most_gradients,
     )
-    if not chains.positions.shape[1]:
+    if not (chains.positions.shape[1] or chains.is_beaten):
         raise KeyboardInterrupt("the run was interrupted before there was a draw to return")
-    tree = _tree(model, target, chains, request)
+    is_empty = chains.is_beaten and chains.found is None
+    tree = DataTree() if is_empty else _tree(model, target, chains, request)
     ended = EndedNuts(
         model=model,
         target=target,
@@ -67,14 +84,16 @@ def sample_nuts(
         positions=chains.positions.reshape(-1, target.raveled.dim),
         rngs=(rng, rng),
         is_checked=True,
-        level="info" if progressbar else "debug",
+        level="info" if options.progressbar else "debug",
         diverging=chains.statistics["diverging"],
         energy=chains.statistics["energy"],
         n_steps=chains.statistics["n_steps"],
         is_stuck=chains.is_stuck,
+        is_beaten=chains.is_beaten,
         is_complete=chains.is_complete,
+        n_gradients=chains.n_gradients,
     )
-    tell(ended, of_model(name))
+    options.told(ended, of_model(name))
     return tree
 
 
@@ -112,30 +131,29 @@ def _tree(model: Model, target: Target, chains: NutsChains, request: SamplingReq
     return tree
 
 
-def _start(
-    model: Model,
+def _starts(
     target: Target,
-    density: DensityGradient,
+    evaluate: WithGradient,
     request: SamplingRequest,
     rng: np.random.Generator,
-    name: str,
-    *,
-    progressbar: bool,
-) -> Callable[[np.random.Generator], Array]:
-    """Where a chain starts, by a generator of its own: at a point of the posterior.
+    options: ExecutionOptions,
+    begin: str,
+) -> tuple[Array, Frame]:
+    """Points (m, d) of the posterior, where chains start, and the frame in which they move.
 
-    Or at the user's point, or, if a prior is improper, near the model's initial point.
+    Or near the user's point, or, if a prior is improper, near the model's initial point.
     """
-    initvals = request.initvals
-    if initvals is not None or not target.prior_draws.may_start:
-        point = make_initial_point_fn(model=model, overrides=dict(initvals or {}))
-        centre, width = target.raveled.ravel(point(0)), np.ones(target.raveled.dim)
-        if initvals:
-            # From where the density is level along an element, nutpie knows no scale of it.
-            _, gradient = density.for_a_thread()(centre)
-            width = np.where(gradient == 0.0, _OFF_LEVEL, 0.0)
-        return lambda own: centre + own.uniform(-width, width)
+    model, initvals = target.model, request.initvals
     target.prepare()
-    population = find_population(target, rng, progressbar=progressbar)
-    tell(SeparateModes(model, target.raveled, population, before_run=True), of_model(name))
-    return lambda own: population.x[own.integers(len(population.x))]
+    if initvals is None and target.prior_draws.may_start:
+        population = find_population(target, rng, progressbar=bool(options.progressbar))
+        tell(SeparateModes(model, target.raveled, population, before_run=True), begin)
+        return population.x, frame_of(population.x, evaluate)
+    point = make_initial_point_fn(model=model, overrides=dict(initvals or {}))
+    centre = target.raveled.ravel(point(0))
+    frame, width = Frame(centre, np.eye(centre.size)), 1.0
+    if initvals:
+        if (cov := local_cov(target, centre)) is None:
+            raise ModelError("initvals must have a positive density, got a point where it is zero")
+        frame, width = frame._replace(factor=np.sqrt(cov)), _OFF_MODE
+    return frame.positions(rng.uniform(-width, width, (_N_POINTS, centre.size))), frame

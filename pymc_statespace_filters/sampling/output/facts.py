@@ -20,6 +20,8 @@ from .convergence import Convergence
 from .likelihood_variance import SeedSpread
 from .phase_statistics import PhaseStatistics
 
+TOLERATED = 0.001  # share of the draws of NUTS that may diverge without a word
+
 
 def of_model(name: str) -> str:
     """The beginning of a message about one of several models, which have names."""
@@ -160,9 +162,32 @@ class EndedNuts(EndedRun):
     diverging, energy, n_steps : ndarray, shape (chains, draws)
     is_stuck : bool
         Whether they diverged, and ended as more iterations had not helped.
+    is_beaten : bool
+        Whether they ended as another sampler takes less.
+    n_gradients : int
+        With those of the warm-up.
     """
 
     diverging: np.ndarray
     energy: np.ndarray
     n_steps: np.ndarray
     is_stuck: bool
+    is_beaten: bool
+    n_gradients: int
+
+    @property
+    def diverges(self) -> bool:
+        """Whether more draws have diverged than can be left unsaid."""
+        return bool(self.diverging.sum() > TOLERATED * self.diverging.size)
+
+
+@dataclass(frozen=True)
+class Raced(ChainFact):
+    """The runs of a race of samplers, in their order, and which one gave the draws.
+
+    ``goal`` is the number of effective draws that they were to have.
+    """
+
+    runs: tuple[EndedRun, ...]
+    best: EndedRun
+    goal: float

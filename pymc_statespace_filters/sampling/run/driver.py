@@ -122,7 +122,9 @@ def _run(
                 tell(WithoutDraws(task.name))
         with COMPILATION:
             return {
-                task.name: task.to_datatree(check_convergence=check, report_level=level)
+                task.name: task.to_datatree(
+                    options.told, check_convergence=check, report_level=level
+                )
                 for task in kept
             }
 

@@ -1,12 +1,12 @@
 """What the chains of a model have found: the DataTree, and the facts about the run."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from xarray import DataTree
 
-from ...facts import tell
 from ...parallel.signals import unless_interrupted
 from ...pymc_model.elements import element_names
 from ...pymc_model.inspection import filters_used
@@ -34,14 +34,16 @@ def tree_of(
     task: "ModelTask",
     results: Results,
     convergence: Convergence | None,
+    told: Callable[..., Any],
     *,
     is_complete: bool,
     check_convergence: bool,
     report_level: str,
 ) -> DataTree:
-    """Make the DataTree of all chains, and tell how the run went; the results are emptied.
+    """Make the DataTree of all chains; the results are emptied.
 
-    ``convergence`` are the diagnostics, if they were asked for.
+    ``convergence`` are the diagnostics, if they were asked for; ``told`` is called with the fact
+    that the chains have ended.
     """
     target, request = task.prepare(), task.request
     of_results = _facts(task, results)
@@ -87,7 +89,7 @@ def tree_of(
         is_complete=is_complete,
         **of_results,
     )
-    tell(ended, of_model(task.name))
+    told(ended, of_model(task.name))
     return tree
 
 

@@ -1,8 +1,9 @@
 """All chains of one model: their starts, how long they go on, and their results."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 from pymc.model import Model
@@ -85,7 +86,7 @@ class ModelTask:
         self._results: dict[int, tuple[Draws, ChainState]] = {}
         # The last diagnostics, and the iterations behind a draw and lengths that they are of.
         self._convergence: tuple[list[int], Convergence | None] = [], None
-        self._began = self._ended = 0.0
+        self._began = self._ended = self._cpu_began = 0.0
 
     @property
     def is_distributed(self) -> bool:
@@ -188,6 +189,7 @@ class ModelTask:
     def start_clock(self) -> None:
         """Note that a chain starts; the first one starts the sampling time."""
         self._began = self._began or time.monotonic()
+        self._cpu_began = self._cpu_began or time.process_time()
 
     def add_result(self, index: int, draws: Draws, state: ChainState) -> None:
         """Keep the result of a chain, from any rank."""
@@ -214,7 +216,8 @@ class ModelTask:
             return True
         if self.request.until_ess is None:
             return False
-        longer = next_length(self.request, self.length, self.convergence(), self.seconds)
+        seconds = time.process_time() - self._cpu_began
+        longer = next_length(self.request, self.length, self.convergence(), seconds)
         if longer is None:
             return False
         if longer.thin > self.length.thin:
@@ -299,8 +302,10 @@ class ModelTask:
         n_skipped = self.request.n_skipped
         return any(len(draws.positions) > n_skipped for draws, _ in self._results.values())
 
-    def to_datatree(self, *, check_convergence: bool, report_level: str) -> DataTree:
-        """Make the DataTree of all chains, and log their report and warnings.
+    def to_datatree(
+        self, told: Callable[..., Any], *, check_convergence: bool, report_level: str
+    ) -> DataTree:
+        """Make the DataTree of all chains; ``told`` is called with the fact that they have ended.
 
         The task keeps no results: the draws are in memory twice, but never three times.
         """
@@ -311,6 +316,7 @@ class ModelTask:
             self,
             [self._results.pop(index) for index in range(request.chains)],
             found,
+            told,
             is_complete=is_complete,
             check_convergence=check_convergence,
             report_level=report_level,

@@ -5,7 +5,7 @@ threads, ranks and output, on which they do not depend.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from importlib.metadata import version
 from typing import Any, NamedTuple
@@ -15,6 +15,7 @@ from pymc.model import Model
 from pytensor.graph.basic import Variable
 
 from ...errors import ModelError
+from ...facts import tell
 from ...parallel.ranks import Ranks
 from ...pymc_model.fingerprint import (
     FINGERPRINT_DIGITS,
@@ -51,7 +52,9 @@ class SamplingRequest(NamedTuple):
     thin: int = 1  # iterations of which a draw is the last
     # With until_ess: whether thin is doubled, until max_draws iterations, and not more draws made.
     doubles_thin: bool = False
-    seconds: float = math.inf  # that doubling may take
+    # With doubles_thin: whether to end as soon as max_draws iterations are expected not to do.
+    gives_up: bool = False
+    seconds: float = math.inf  # of processors, that doubling may take
     former: FormerChains | None = None  # that are to go on
 
     @property
@@ -114,6 +117,7 @@ class ExecutionOptions(NamedTuple):
     progressbar: bool | str
     compute_convergence_checks: bool
     ranks: Ranks
+    told: Callable[..., Any] = tell  # what becomes of the fact that a run has ended
 
     def check(self) -> None:
         """Raise a `ModelError` if an argument is not as ``sample_dram`` describes it."""

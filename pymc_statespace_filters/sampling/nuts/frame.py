@@ -1,0 +1,66 @@
+"""Coordinates in which NUTS moves: those in which points of the posterior are round."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..starts.langevin import metric_factor
+
+Array = NDArray[np.float64]
+WithGradient = Callable[[Array], tuple[float, Array]]
+
+_MOST_POINTS = 512  # whose gradients are asked
+_PER_DIMENSION = 3  # points at least
+
+
+class Frame(NamedTuple):
+    """Coordinates z of positions x = centre + factor z.
+
+    nutpie takes no mass matrix. In these coordinates it is the identity where its warm-up begins,
+    and what the search for starts has learnt is not learnt again, in long trajectories.
+    """
+
+    centre: Array  # (d,)
+    factor: Array  # (d, d), lower triangular
+    is_whole: bool = False  # whether correlations are in it
+
+    @property
+    def adaptation(self) -> str:
+        """What nutpie is to learn: with correlations known, scales take fewer gradients."""
+        return "diag" if self.is_whole else "low_rank"
+
+    def positions(self, z: Array) -> Array:
+        """Positions (..., d) of points in these coordinates."""
+        return self.centre + z @ self.factor.T
+
+    def coordinates(self, x: Array) -> Array:
+        """The coordinates of one position (d,)."""
+        return np.linalg.solve(self.factor, x - self.centre)
+
+    def within(self, evaluate: WithGradient) -> WithGradient:
+        """A log-density with its gradient, as functions of these coordinates."""
+
+        def in_frame(z: Array) -> tuple[float, Array]:
+            value, gradient = evaluate(self.positions(z))
+            return value, gradient @ self.factor
+
+        return in_frame
+
+
+def frame_of(points: Array, evaluate: WithGradient) -> Frame:
+    """The frame of points (m, d) of a posterior and their gradients, see `metric_factor`.
+
+    Where the points are too few, or do not vary in every direction, that of their deviations.
+    """
+    x = points[:: -(-len(points) // _MOST_POINTS)]
+    gradients = np.array([evaluate(point)[1] for point in x])
+    known = np.isfinite(gradients).all(axis=1)
+    factor = None
+    if known.sum() >= _PER_DIMENSION * x.shape[1]:
+        factor = metric_factor(x[known], gradients[known])
+    if factor is not None:
+        return Frame(points.mean(axis=0), factor, is_whole=True)
+    sd = points.std(axis=0)
+    return Frame(points.mean(axis=0), np.diag(np.where(sd > 0.0, sd, 1.0)))

@@ -1,0 +1,113 @@
+"""The race of samplers: who gives the draws, that no clock decides it, and what is said of it."""
+
+import logging
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters import advice
+from pymc_statespace_filters.advice.remedies import reparametrise
+from pymc_statespace_filters.sampling import race
+from pymc_statespace_filters.sampling.nuts.sample_nuts import sample_nuts
+from pymc_statespace_filters.sampling.run.request import RunArguments
+from tests.sampling.test_nuts_starts import schools
+
+CALL = {"random_seed": 1, "progressbar": False}
+
+
+def stiff(n=30):
+    """Normal, of widths from 1 to 1000: too many dimensions for the walk, few for NUTS."""
+    rng = np.random.default_rng(0)
+    rotated = np.linalg.qr(rng.normal(size=(n, n)))[0] * np.geomspace(1.0, 1000.0, n)
+    with pm.Model() as model:
+        x = pm.Normal("x", 0, 1, shape=n)
+        pm.Normal("y", x @ rotated, 1.0, observed=np.zeros(n))
+    return model
+
+
+def run(model, caplog, **call):
+    caplog.clear()
+    with caplog.at_level(logging.DEBUG, logger="pymc"):
+        idata = psf.sample(model=model, **CALL | call)
+    return idata, [r.getMessage() for r in caplog.records]
+
+
+@pytest.fixture
+def other_clock(monkeypatch):
+    """Seconds a hundred times as long, as on a machine that others use."""
+    for clock in (time.process_time, time.perf_counter, time.thread_time):
+        monkeypatch.setattr(time, clock.__name__, partial(lambda of: 100.0 * of(), clock))
+
+
+def test_a_walk_that_is_quick_is_not_raced(caplog):
+    idata, said = run(schools(centred=False), caplog)
+    assert idata.attrs["sampler"] == "dram"
+    assert idata.attrs["sampler_reason"].startswith("DRAM made draws worth")
+    assert not any("NUTS, from its points" in text for text in said)
+
+
+def test_nuts_from_the_points_of_a_slow_walk(caplog, monkeypatch):
+    monkeypatch.setattr(race, "_is_too_slow", lambda walk: True)
+    monkeypatch.setattr(race, "_MARGIN", np.inf)
+    idata, said = run(stiff(), caplog, draws=250)
+    (told,) = (text for text in said if "NUTS, from its points, made draws worth" in text)
+    assert idata.attrs["sampler_reason"] == told.removesuffix(".")
+    assert not any("until_ess" in text for text in said)  # what the other lacks nobody needs
+
+
+def test_no_clock_decides(request, caplog, monkeypatch):
+    monkeypatch.setattr(race, "_is_too_slow", lambda walk: True)
+    monkeypatch.setattr(race, "_MARGIN", np.inf)
+    call = {"draws": 100, "tune": 200}
+    first = run(stiff(), caplog, **call)[0]
+    request.getfixturevalue("other_clock")
+    again = run(stiff(), caplog, **call)[0]
+    assert again.attrs["sampler_reason"] == first.attrs["sampler_reason"]
+    xr.testing.assert_equal(again["posterior"].to_dataset(), first["posterior"].to_dataset())
+
+
+def test_the_walk_goes_on_where_nuts_diverges(caplog, monkeypatch):
+    """At a neck, from the draws of NUTS; each has been tried, so no message sends to the other."""
+    monkeypatch.setattr(race, "_WALK", 1)
+    monkeypatch.setattr(race, "_MARGIN", np.inf)
+    idata, said = run(schools(centred=True), caplog)
+    (told,) = (text for text in said if "DRAM, from the better points," in text)
+    assert "NUTS, from its points, diverged in" in told
+    assert idata.attrs["sampler_reason"] == told.removesuffix(".")
+    assert idata.attrs["sampler"] in told.lower()
+    assert not any("sampler=" in text or "psf.sample" in text for text in said)
+
+
+@pytest.mark.parametrize("most", [500.0, 3000.0, np.inf])
+def test_nuts_ends_where_it_takes_more_than_it_may(most):
+    """In its warm-up, which leaves nothing, and later; how fast it runs counts for nothing."""
+    points, runs = np.random.default_rng(0).normal(size=(400, 8)), []
+    given = RunArguments(draws=100, tune=100, until_ess=399, max_draws=100, **CALL)
+    options = given.options(None)._replace(told=lambda fact, begin: runs.append(fact))
+    request = given.request()._replace(doubles_thin=True, max_draws=800)
+    sample_nuts(stiff(8), request, options, "", points, most)
+    (nuts,) = runs
+    assert nuts.is_beaten == (most < np.inf)
+    assert (nuts.n_gradients > most) == nuts.is_beaten
+    assert (len(nuts.positions) == 0) == (most == 500.0)
+
+
+def test_no_words_name_a_sampler_as_a_remedy():
+    for path in Path(advice.__file__).parent.glob("*.py"):
+        assert "sampler=" not in path.read_text(), path
+
+
+def test_parameters_that_move_together_are_named():
+    rng = np.random.default_rng(1)
+    common = rng.normal(size=(1000, 1))
+    x = np.hstack([common + 0.1 * rng.normal(size=(1000, 3)), rng.normal(size=(1000, 1))])
+    names = ["mass", "stiffness", "gain", "noise"]
+    text = reparametrise(names, x, "gain")
+    assert text.startswith("fix one of mass, stiffness and gain, which move together (correl")
+    assert reparametrise(names, x, "noise") == "reparametrise noise"
