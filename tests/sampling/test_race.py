@@ -13,7 +13,7 @@ import xarray as xr
 import pymc_statespace_filters as psf
 from pymc_statespace_filters import advice
 from pymc_statespace_filters.advice.remedies import reparametrise
-from pymc_statespace_filters.sampling import race
+from pymc_statespace_filters.sampling import chosen_sampler, race
 from pymc_statespace_filters.sampling.nuts.sample_nuts import sample_nuts
 from pymc_statespace_filters.sampling.run.request import RunArguments
 from tests.sampling.test_nuts_starts import schools
@@ -62,6 +62,7 @@ def test_nuts_from_the_points_of_a_slow_walk(caplog, monkeypatch):
 
 
 def test_no_clock_decides(request, caplog, monkeypatch):
+    monkeypatch.setattr(chosen_sampler, "TIME_LIMIT", np.inf)  # which alone depends on one
     monkeypatch.setattr(race, "_is_too_slow", lambda walk: True)
     monkeypatch.setattr(race, "_MARGIN", np.inf)
     call = {"draws": 100, "tune": 200}
