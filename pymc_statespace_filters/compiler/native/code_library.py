@@ -21,9 +21,6 @@ from uuid import uuid4
 from llvmlite.binding import Linkage
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
-from numba.core.typed_passes import AnnotateTypes
-
-from .borrowed_arrays import CountNoReferences
 
 # Called from Python, a function without machine code is a TypeError. Its slot is called with an
 # object that is not callable, the arguments and the keywords.
@@ -151,14 +148,6 @@ class LinkedCompiler(_LibraryCompiler):
         super().__init__(*arguments)
         if isinstance(self.state.library, _LinkedLibrary):
             self.state.library.inlined = self.state.flags.forceinline
-
-    def define_pipelines(self) -> list[Any]:
-        """Numba's passes, and one that leaves out what need not be counted."""
-        pipelines = super().define_pipelines()
-        for pipeline in pipelines:
-            pipeline.add_pass_after(CountNoReferences, AnnotateTypes)
-            pipeline.finalize()
-        return pipelines
 
 
 def with_internal_linkage(function: Any) -> Any:

@@ -64,6 +64,7 @@ def start(call):
 @njit_internal
 def advance(call, j, k, last, parts):
     """Move the members from step k to the last one before, or at, row j."""
+    # Taken out of their tuples before the loop, which would count references at every step.
     system, noise, members, X = call.system, call.noise, parts.members, parts.members.X
     observer, nothing, ancestors = call.observer, call.nothing, call.resampling.ancestors
     t0, dt, width = call.record.t0, system.dt, call.local.width
