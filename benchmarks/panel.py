@@ -61,7 +61,7 @@ class Panel:
         """The functions of a single record, one record after the other."""
         compiled = compile_system(self.system)
         forward = self.filter.compile_taped if gradient else self.filter.compile
-        forward, noise = forward(compiled).function, 0 if gradient else (0, np.empty(0))
+        forward = forward(compiled).function
         reverse = self.filter.compile_pullback(compiled).function if gradient else None
 
         @numba.njit
@@ -69,10 +69,10 @@ class Panel:
             total, bars, J = 0.0, np.ones(STEPS.size), STEPS.size
             for i in range(theta.shape[0]):
                 d, u = observed[i * J : (i + 1) * J], inputs[rows[i * J, 2] :]
-                found = forward(theta[i], STEPS, d, u, 0.0, noise)
+                found = forward(theta[i], STEPS, d, u, 0.0, 0)
                 total += found[0].sum()
                 if gradient:
-                    reverse(theta[i], STEPS, d, u, 0.0, noise, found[2], bars)
+                    reverse(theta[i], STEPS, d, u, 0.0, 0, found[2], bars)
             return total
 
         table = self.rows, self.observed, self.inputs

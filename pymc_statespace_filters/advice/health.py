@@ -8,7 +8,6 @@ from ..compiler.lowering.compiled_system import compile_system
 from ..evaluation.health import Arguments, Health
 from ..filters.catalog import exact_filter
 from ..filters.outcomes import COLLAPSED, Failure
-from ..filters.protocol import HealthFilter
 from ..filters.written import short_form
 from ..ops.base import evaluator
 from ..ops.likelihood import LogLikelihood
@@ -154,8 +153,6 @@ def _extent(system: StateSpaceModel, filter: Any, arguments: Arguments) -> str |
     None if they decided no term, or the sum is right for every seed, as that of a guided filter
     of a linear system.
     """
-    if not isinstance(filter, HealthFilter):
-        return "The log-likelihood may be far too low, by a different amount for every seed"
     terms, n_effective, _ = evaluator(TermHealth(system, filter))(*arguments)
     few = np.flatnonzero(n_effective < COLLAPSED)
     if few.size == 0:

@@ -11,7 +11,6 @@ from ..checks.filters.checks import stored
 from ..checks.filters.finding import OFF
 from ..errors import INSIDE, FilterWarning
 from ..filters.outcomes import COLLAPSED
-from ..filters.protocol import HealthFilter
 from ..pymc_model.checked_model import checked_model
 from ..pymc_model.state_space_variable import StateSpaceVariable
 from ..states.draws import select_draws
@@ -232,12 +231,10 @@ def _of_record(record: RecordAtDraws, rng: np.random.Generator) -> _Found:
 def _term_health(
     record: RecordAtDraws, before: States, rng: np.random.Generator
 ) -> TermHealthAtDraws:
-    """Effective numbers behind the terms; of the filtered states if the filter does not tell."""
-    filter = record.variable.filter
-    if isinstance(filter, HealthFilter):
+    """Effective numbers behind the terms."""
+    if record.variable.filter.noisy:
         return record.term_health(rng)
-    states = record.states("filtered", record.steps, rng) if filter.noisy else before
-    return TermHealthAtDraws(states.seeds, states.n_effective, states.health)
+    return TermHealthAtDraws(before.seeds, before.n_effective, before.health)
 
 
 def _results_by_row(

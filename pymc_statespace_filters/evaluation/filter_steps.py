@@ -7,10 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..compiler.lowering.compiled_system import compile_system
-from ..compiler.native.planned_function import PlannedFunction
-from ..filters.protocol import BatchFilter, Filter, ResumableFilter, properties
+from ..filters.protocol import BatchFilter, Filter, properties
 from ..ops.base import evaluator, kernel
-from ..ops.states import GoingOn, ResumableRun
+from ..ops.states import FilterRun, GoingOn
 from ..system.model import StateSpaceModel
 from ..system.own_units import in_own_units, law_in_own_units, moments_of_members
 
@@ -103,9 +102,7 @@ class _Point:
         before: Array,
     ) -> None:
         self._system, self._is_in_own_units = system, bool(system.drifting)
-        function = kernel(ResumableRun(system, filter))
-        assert isinstance(function, PlannedFunction)  # as the filter resumes
-        self._function = function.loaded()
+        self._function = kernel(FilterRun(system, filter)).loaded()
         self._inputs = _Inputs(system.n_input_columns)
         self._step, self._datum = np.zeros(1, dtype=np.int64), np.zeros((1, system.p))
         self._theta = np.require(theta, requirements=("C", "W"))
@@ -200,7 +197,6 @@ class _SideBySide:
         terms, health, self._after = self._evaluate(
             self._theta, steps, data, self._inputs.rows, self._t0, self._before
         )
-        assert isinstance(self._filter, ResumableFilter)
         law = self._filter.law_of_state(compile_system(self._system), self._after)
         mean, cov = law.moments()
         if self._system.drifting:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..errors import ModelError
 from ..filters.checks import check_choice
 from ..filters.outcomes import NONE, Failure
-from ..filters.protocol import Filter, ResumableFilter
+from ..filters.protocol import Filter
 from ..system.checks import check_finite, check_random_seed
 from ..system.model import StateSpaceModel
 from ..system.parameters import flat_parameters
@@ -243,7 +243,7 @@ def online(
     Parameters
     ----------
     system : StateSpaceModel
-    filter : a filter of the package, or a user's own that goes on from its state
+    filter : a filter of the package, or a user's own
     params : mapping
         Parameter values by name; or draws of them, arrays with leading dimensions, such as chain
         and draw (a declared parameter's own shape comes last). Draws are a mixture with equal
@@ -294,11 +294,6 @@ def online(
     True
     """
     check_choice(system, filter)
-    if not isinstance(filter, ResumableFilter):
-        raise ModelError(
-            f"{type(filter).__name__} leaves no state from which it could go on, as the filters of "
-            "the package do"
-        )
     theta = flat_parameters(system, params)
     theta = theta.reshape(math.prod(theta.shape[:-1]), theta.shape[-1])  # of all chains
     if not len(theta):

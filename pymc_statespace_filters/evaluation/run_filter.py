@@ -12,9 +12,9 @@ import xarray as xr
 from ..compiler.numerics.philox import seeds_of_records
 from ..errors import ModelError
 from ..filters.checks import check_choice
-from ..filters.protocol import Filter, ResumableFilter, check_states_filter, properties
+from ..filters.protocol import Filter, properties
 from ..ops.base import evaluator
-from ..ops.states import FilterRun, ResumableRun, States
+from ..ops.states import FilterRun, States
 from ..system.clock import Clock
 from ..system.given_record import GivenRecord
 from ..system.input_columns import resets_at, with_resets
@@ -91,8 +91,8 @@ def run_filter(
     Raises
     ------
     ModelError
-        If an argument does not fit the system, or ``state`` is of a filter that cannot go on, or of
-        a run that failed or differs in more than its rows.
+        If an argument does not fit the system, or ``state`` is of a run that failed or differs in
+        more than its rows.
 
     Warns
     -----
@@ -159,24 +159,17 @@ def run_filter(
         first = [np.int64(one[0]) + 1 for one in before]
     at_steps = [each[1] for each in arguments]
     rows = [own[own >= k] for own, k in zip((rows_at(at, s) for s in at_steps), first, strict=True)]
-    left: list[np.ndarray] = []
-    if isinstance(filter, ResumableFilter):
-        evaluate = evaluator(ResumableRun(system, filter))
-        parts = zip(arguments, rows, before, strict=True)
-        found = [evaluate(*each, own, start) for each, own, start in parts]
-        runs, left = [one[:-1] for one in found], [one[-1] for one in found]
-    else:
-        evaluate = evaluator(FilterRun(system, filter))
-        runs = [evaluate(*each, own) for each, own in zip(arguments, rows, strict=True)]
-    terms, health, *states = (list(parts) for parts in zip(*runs, strict=True))
+    evaluate = evaluator(FilterRun(system, filter))
+    parts = zip(arguments, rows, before, strict=True)
+    runs = [evaluate(*each, own, start) for each, own, start in parts]
+    terms, health, *states, left = (list(results) for results in zip(*runs, strict=True))
     tell_of_health(system, filter, np.array(health), lambda i: arguments[i], labels=labels)
     row_dim, term_dim = ("time", "obs_time") if panel is None else ("row", "obs")
     dataset = _dataset(system, row_dim, *map(np.concatenate, states))
     dataset = dataset.assign(log_likelihood=(term_dim, np.concatenate(terms)))
-    if left:
-        dataset = dataset.assign(stored(left, labels))
+    dataset = dataset.assign(stored(left, labels))
     if properties(filter).finds_path and state is None:
-        evaluate = evaluator(States(system, check_states_filter(filter), "most probable"))
+        evaluate = evaluator(States(system, filter, "most probable"))
         paths = [evaluate(*each, own, 0)[0] for each, own in zip(arguments, rows, strict=True)]
         dataset["most_probable_path"] = (row_dim, "state"), np.concatenate(paths)
     if record.is_panel:
@@ -251,14 +244,9 @@ def states_before(
     Raises
     ------
     ModelError
-        If the filter cannot go on, or the earlier run is not one of the same filter, system,
-        parameters, seed and records, or failed.
+        If the earlier run is not one of the same filter, system, parameters, seed and records, or
+        failed.
     """
-    if not isinstance(filter, ResumableFilter):
-        raise ModelError(
-            f"{type(filter).__name__} cannot go on from an earlier run: it has no state that holds "
-            "for the rows to come; run it over all rows"
-        )
     if not isinstance(state, xr.Dataset) or STATE not in state:
         raise ModelError(f"state must be what run_filter returned, got {type(state).__name__}")
     known = None if _RECORD not in state else state[_RECORD].values.tolist()

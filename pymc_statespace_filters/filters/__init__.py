@@ -1,7 +1,7 @@
-"""The filters, and what your own filter needs: the contract in `protocol`, and base classes.
+"""The filters, and what your own filter needs: base classes, and what its three functions call.
 
-`EnsembleFilterBase` and `ParticleFilter` with `member_filter` give a filter with members everything
-but its update; a filter of another kind satisfies `Filter` by itself.
+`member_filter` makes one of the functions; `PartsFilter` is the base of a filter with a single
+Gaussian, `ParticleFilter` or `EnsembleFilterBase` that of a filter with members.
 """
 
 import lazy_loader

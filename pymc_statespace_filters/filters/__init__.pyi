@@ -2,24 +2,25 @@ from .bootstrap import BootstrapPF
 from .ekf import EKF
 from .enkf import EnKF
 from .ensemble.base import EnsembleFilterBase
-from .ensemble.loop import Outcome, failed, member_filter
+from .ensemble.callbacks import FORECAST
+from .ensemble.evaluation import members_of, show, time_of
+from .ensemble.loop import Outcome, Plain, failed, member_filter, updated
+from .ensemble.part_moments import read_moments, write_moments
 from .ensemble.particle_filter import ParticleFilter
+from .ensemble.parts import PartsFilter
 from .finite_state import FiniteStateFilter
 from .grid import GridFilter
 from .guided_pf import GuidedPF
 from .imm import IMM
 from .iplf import IPLF
 from .pf_enkf import PFEnKF
+from .plan import initialise, log_density, propagate, simulate
 from .protocol import (
     BatchFilter,
-    CompiledFunction,
     DifferentiableFilter,
     EnsembleFilter,
     Filter,
-    HealthFilter,
     PredictionFilter,
-    RunFilter,
-    StatesFilter,
     System,
     ToleranceFilter,
 )
@@ -28,13 +29,13 @@ from .ukf import UKF
 
 __all__ = [
     "EKF",
+    "FORECAST",
     "IMM",
     "IPLF",
     "RBPF",
     "UKF",
     "BatchFilter",
     "BootstrapPF",
-    "CompiledFunction",
     "DifferentiableFilter",
     "EnKF",
     "EnsembleFilter",
@@ -43,15 +44,24 @@ __all__ = [
     "FiniteStateFilter",
     "GridFilter",
     "GuidedPF",
-    "HealthFilter",
     "Outcome",
     "PFEnKF",
     "ParticleFilter",
+    "PartsFilter",
+    "Plain",
     "PredictionFilter",
-    "RunFilter",
-    "StatesFilter",
     "System",
     "ToleranceFilter",
     "failed",
+    "initialise",
+    "log_density",
     "member_filter",
+    "members_of",
+    "propagate",
+    "read_moments",
+    "show",
+    "simulate",
+    "time_of",
+    "updated",
+    "write_moments",
 ]

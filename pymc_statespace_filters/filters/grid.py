@@ -31,7 +31,7 @@ from .point_mass.predictions import GRID_PREDICTIONS
 from .point_mass.segment_pass import along_record, finished
 from .point_mass.states import GRID_STATES
 from .protocol import System, check_sensor_has_noise
-from .signatures import LIKELIHOOD_OF_NOISE, PREDICTIONS, RUN, STATES
+from .signatures import LIKELIHOOD, PREDICTIONS, RUN, STATES
 from .state_law import StateLaw
 
 # Beside a kink the error falls with the square of the spacing: 8192 points reach about 1e-6.
@@ -153,7 +153,7 @@ class GridFilter:
 
     def compile(self, system: System) -> PlannedFunction:
         """Compile the log-likelihood."""
-        return PlannedFunction(self._plan(system, POINT_MASS), *LIKELIHOOD_OF_NOISE)
+        return PlannedFunction(self._plan(system, POINT_MASS), *LIKELIHOOD)
 
     def compile_states(self, system: System, moment: str) -> PlannedFunction:
         """Compile "predicted", "filtered" or "smoothed" states.

@@ -1,12 +1,12 @@
 """What a filter is: the contract between filters and everything that uses them.
 
 A filter is an immutable, hashable object that holds settings. It states which systems it supports
-and compiles functions for one system, which it is given as a `System`. No base class is needed:
-`log_likelihood`, `StateSpace`, `sample_dram` and the evidence take any `Filter`. Its other
-abilities are the methods of `RunFilter`, `ResumableFilter`, `StatesFilter`, `BatchFilter`,
-`DifferentiableFilter`, `EnsembleFilter` and `ToleranceFilter`.
+and plans functions for one system, which it is given as a `System`. A filter of a user's own is
+three functions and a subclass of `ensemble.parts.PartsFilter`. What only some filters can are the
+methods of `BatchFilter`, `DifferentiableFilter`, `EnsembleFilter`, `PredictionFilter` and
+`ToleranceFilter`.
 
-Arguments and results of the compiled functions are those of `filters.signatures`. Their arrays:
+Arguments and results of the functions are those of `filters.signatures`. Their arrays:
 ``theta`` (k,) parameters; ``steps`` (J,) int64, the step of each observation; ``observed`` (J, p),
 NaN where missing; ``inputs`` (rows, n_inputs), row k holds during step k; ``t0`` the time of step
 0. They return ``terms`` (J,), log p(d_j | d_1 .. d_{j-1}), 0 for a row that is wholly missing and
@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..compiler.codegen.function_types import CompiledFunction as CompiledFunction
 from ..compiler.native.plan import Plan
 from ..compiler.native.planned_function import PlannedFunction
 from ..errors import ModelError
@@ -29,8 +28,6 @@ from .state_law import StateLaw
 if TYPE_CHECKING:
     from ..compiler.lowering.compiled_system import CompiledSystem
 
-type Compiled = CompiledFunction | PlannedFunction
-"""A function that numba compiles for one system, or one of a plan, which needs no compilation."""
 type System = CompiledSystem
 """One system as a filter sees it: sizes, properties, and functions compiled when asked for."""
 
@@ -53,51 +50,28 @@ class Filter(Protocol):
     def is_exact_for(self, system: System) -> bool:
         """Whether the likelihood, or the mean of its estimates, is that of the system."""
 
-    def compile(self, system: System) -> Compiled:
+    def compile(self, system: System) -> PlannedFunction:
         """Compile the log-likelihood."""
 
-
-@runtime_checkable
-class RunFilter(Filter, Protocol):
-    """A filter that `run_filter` can show."""
-
-    def compile_run(self, system: System) -> Compiled:
+    def compile_run(self, system: System) -> PlannedFunction:
         """Compile one run with all that it computes."""
 
-
-@runtime_checkable
-class ResumableFilter(RunFilter, Protocol):
-    """A filter that goes on from a vector, its state after earlier rows."""
-
-    def law_of_state(self, system: System, states: NDArray[np.float64]) -> StateLaw:
-        """Return the law of the system's state at m points, from vectors (m, S)."""
-
-
-@runtime_checkable
-class StatesFilter(Filter, Protocol):
-    """A filter that gives states at draws: `filtered_states`, `smoothed_states`, `forecast`."""
-
-    def compile_states(self, system: System, moment: str) -> Compiled:
+    def compile_states(self, system: System, moment: str) -> PlannedFunction:
         """Compile "predicted", "filtered" or "smoothed" states."""
         ...
 
     def smoothing_method(self, system: System) -> str:
         """Name the method of the smoothed states."""
 
-
-@runtime_checkable
-class HealthFilter(Filter, Protocol):
-    """A filter that tells how many of its members are behind every term."""
-
-    def compile_health(self, system: System) -> Compiled:
-        """Compile the effective number of every term."""
+    def law_of_state(self, system: System, states: NDArray[np.float64]) -> StateLaw:
+        """Return the law of the system's state at m points, from vectors (m, S) that it left."""
 
 
 @runtime_checkable
 class PredictionFilter(Filter, Protocol):
     """A filter that knows the law of every observation given those before it."""
 
-    def compile_predictions(self, system: System) -> Compiled:
+    def compile_predictions(self, system: System) -> PlannedFunction:
         """Compile the law of every observation, for systems with additive Gaussian noise."""
 
 
@@ -112,13 +86,13 @@ class DifferentiableFilter(Filter, Protocol):
     deterministic system the mean is enough. A filter with another tape is a `PredictionFilter`.
     """
 
-    def compile_gradient(self, system: System) -> Compiled:
+    def compile_gradient(self, system: System) -> PlannedFunction:
         """Compile both passes as one function."""
 
-    def compile_taped(self, system: System) -> Compiled:
+    def compile_taped(self, system: System) -> PlannedFunction:
         """Compile the forward pass: terms, health and the tape."""
 
-    def compile_pullback(self, system: System) -> Compiled:
+    def compile_pullback(self, system: System) -> PlannedFunction:
         """Compile the backward pass: (theta .. seed, tape, terms_bar) -> theta_bar."""
 
 
@@ -140,7 +114,7 @@ class BatchFilter(DifferentiableFilter, Protocol):
 
 @runtime_checkable
 class EnsembleFilter(Filter, Protocol):
-    """A filter of members moved by normals, which can be stored, moved a little, or distributed."""
+    """Every noisy filter: its members are moved by normals, which can be stored and distributed."""
 
     def size(self) -> int:
         """Return the number of members."""
@@ -156,6 +130,9 @@ class EnsembleFilter(Filter, Protocol):
 
     def stored_noise(self, system: System) -> PlannedFunction:
         """Compile the making of these normals: (steps, seed) -> one vector."""
+
+    def compile_health(self, system: System) -> PlannedFunction:
+        """Compile the effective number of members behind every term."""
 
 
 @runtime_checkable
@@ -186,19 +163,10 @@ def properties(filter: Filter) -> Properties:
     return Properties(*(getattr(filter, name, False) for name in Properties._fields))
 
 
-def check_states_filter(filter: Filter) -> StatesFilter:
-    """Return the filter, or raise if it gives no states."""
-    if not isinstance(filter, StatesFilter):
-        raise ModelError(
-            f"{filter!r} gives no states: it has no compile_states; name a filter of the package "
-            f"instead (filter=...)"
-        )
-    return filter
-
-
 def check_filter(filter: Any) -> None:
     """Raise unless this is a filter."""
-    if isinstance(filter, type) or not isinstance(filter, Filter):
+    is_filter = isinstance(filter, Filter) and not isinstance(filter, type)
+    if not is_filter or (filter.noisy and not isinstance(filter, EnsembleFilter)):
         raise ModelError(
             f"filter must be a filter such as psf.EKF() or psf.EnKF(1250), got {filter!r}"
         )

@@ -39,9 +39,6 @@ SEEDED: Names = (*RECORD, ("seed", 0))
 _TERMS, _HEALTH, _TAPE, _TERMS_BAR = ("terms", 1), ("health", 1), ("tape", 2), ("terms_bar", 1)
 
 LIKELIHOOD = Signature(SEEDED, (_TERMS, _HEALTH))
-LIKELIHOOD_OF_NOISE = Signature((*RECORD, ("noise", 0)), (_TERMS, _HEALTH))
-"""Of `Filter.compile`. ``noise`` is a seed and a vector of stored normals, of which a deterministic
-filter reads neither; where the vector is empty the seed counts."""
 TAPED = Signature(SEEDED, (_TERMS, _HEALTH, _TAPE))
 PULLBACK = Signature((*SEEDED, _TAPE, _TERMS_BAR), (("theta_bar", 1),))
 GRADIENT = Signature((*SEEDED, _TERMS_BAR), (("theta_bar", 1),))
@@ -56,13 +53,12 @@ STATES = Signature(
 """Mean, sd and a draw (R, n) of the state at the steps ``wanted``; n_effective (R,); and health.
 The draws of one ``draw_seed`` belong together. From a failing observation on all are NaN."""
 RUN = Signature(
-    (*SEEDED, ("wanted", 1)),
-    (_TERMS, _HEALTH, ("mean", 2), ("cov", 3), ("members", 3), ("weights", 2)),
+    (*SEEDED, ("wanted", 1), ("state", 1)),
+    (_TERMS, _HEALTH, ("mean", 2), ("cov", 3), ("members", 3), ("weights", 2), ("state", 1)),
 )
 """Terms, health, and the state at the steps ``wanted``, given the observations up to each: mean
-(R, n), covariance (R, n, n), members (R, N, n) and weights (R, N); N is 0 without members."""
-RESUMED = Signature((*RUN.arguments, ("state", 1)), (*RUN.results, ("state", 1)))
-"""From a state of the filter, empty at the start, with the state that it leaves."""
+(R, n), covariance (R, n, n), members (R, N, n) and weights (R, N); N is 0 without members. The
+``state`` is that of the filter, empty at the start, and the one that it leaves."""
 GOING_ON = Signature((*RECORD, ("state", 1)), (_TERMS, _HEALTH, ("state", 1)))
 """The likelihood of rows from a state of a deterministic filter, with the state that it leaves."""
 PREDICTIONS = Signature(

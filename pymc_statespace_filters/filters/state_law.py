@@ -30,6 +30,11 @@ def exact_states(n: int) -> Layout:
     return Layout(n, n, np.arange(n))
 
 
+def gaussian_states(n: int) -> Layout:
+    """The layout of Gaussians: the mean and the lower triangle of the covariance."""
+    return Layout(n + n * (n + 1) // 2, 0, np.arange(n))
+
+
 class StateLaw(NamedTuple):
     """Mixtures of K parts at m points.
 

@@ -5,7 +5,7 @@ from typing import ClassVar
 from ..compiler.native.plan import Plan
 from ..compiler.native.planned_function import PlannedFunction
 from .protocol import System
-from .signatures import GRADIENT, LIKELIHOOD_OF_NOISE, PULLBACK, TAPED
+from .signatures import GRADIENT, LIKELIHOOD, PULLBACK, TAPED
 
 
 class TapedFilter:
@@ -22,7 +22,7 @@ class TapedFilter:
 
     def compile(self, system: System) -> PlannedFunction:
         """Compile the log-likelihood."""
-        return PlannedFunction(self.plan_of_pass(system), *LIKELIHOOD_OF_NOISE)
+        return PlannedFunction(self.plan_of_pass(system), *LIKELIHOOD)
 
     def compile_taped(self, system: System) -> PlannedFunction:
         """Compile the forward pass, with a third result: the tape."""

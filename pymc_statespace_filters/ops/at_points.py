@@ -1,18 +1,12 @@
 """A filter at many points: machine code in threads, without a graph."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
-from threading import Lock
-from typing import Any
 
 import numpy as np
-import pytensor
 
-from ..compiler.native.compilation import COMPILATION, undamaged_files
-from ..compiler.native.planned_function import PlannedFunction
+from ..compiler.native.compilation import COMPILATION
 from ..compiler.native.planned_rows import PlannedRow
-from ..compiler.native.pytensor_function import NativeFunction
-from ..compiler.native.rows import RowFunction, Rows
+from ..compiler.native.rows import Rows
 from ..filters.signatures import POINTS
 from ..parallel.shared_rows import evaluated_rows
 from ..parallel.threads import Pieces
@@ -83,28 +77,9 @@ class FilterAtPoints:
 
 def _row_function(
     operation: FilterOp, names: Sequence[str], kept: list[int], example: list[np.ndarray]
-) -> RowFunction:
+) -> PlannedRow:
     """The function of arguments in this order."""
     with COMPILATION:
-        function = kernel(operation)
-        if isinstance(function, PlannedFunction):
-            arguments = [name for name, _ in operation.arguments]
-            order = [arguments.index(name) for name in names]
-            return PlannedRow(function.loaded(), order, example, kept)
-        compiled, lock = _without_plan(operation, tuple(names), tuple(kept))
-    return NativeFunction(compiled, example, one_at_a_time=lock)
-
-
-# Made once for all records and calls: one takes seconds to compile.
-@lru_cache(maxsize=64)
-def _without_plan(
-    operation: FilterOp, names: tuple[str, ...], kept: tuple[int, ...]
-) -> tuple[Any, Lock]:
-    """The PyTensor function of a filter without a plan, such as a user's; a lock for its calls."""
-    symbols = {name: operation.symbol(name) for name, _ in operation.arguments}
-    outputs = operation(*symbols.values(), return_list=True)
-    with undamaged_files():
-        compiled = pytensor.function(
-            [symbols[name] for name in names], [outputs[i] for i in kept], trust_input=True
-        )
-    return compiled, Lock()
+        function = kernel(operation).loaded()
+    arguments = [name for name, _ in operation.arguments]
+    return PlannedRow(function, [arguments.index(name) for name in names], example, kept)

@@ -5,7 +5,7 @@ outputs. No data are closed over, so neither PyTensor's merging of equal nodes n
 machine code on disk can confuse two data sets.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from typing import Any, ClassVar, Self
 
@@ -16,17 +16,15 @@ from pytensor.graph.basic import Apply, Variable
 from pytensor.graph.op import Op
 from pytensor.link.numba.dispatch.basic import numba_njit, register_funcify_and_cache_key
 
-from ..compiler.codegen.function_types import CompiledFunction
 from ..compiler.lowering.compiled_system import CompiledSystem, compile_system
 from ..compiler.native.compilation import COMPILATION
 from ..compiler.native.plan import ARGUMENTS, Plan
 from ..compiler.native.planned_function import PlannedFunction
 from ..compiler.native.python_call import TimedCall, call_machine_code
-from ..filters.protocol import Compiled, Filter
+from ..filters.protocol import Filter
 from ..filters.signatures import ONE_RECORD, Form, Signature
 from ..system.model import StateSpaceModel
 from ..system.panel_records import STEP
-from . import unplanned
 
 HEALTH_SIZE = 3
 _READY = 0x0001 | 0x0100 | 0x0400  # flags of NumPy: contiguous in C's order, aligned, writeable
@@ -49,8 +47,6 @@ class FilterOp(Op):
     signature: ClassVar[Signature]
     # Whether its machine code exchanges numbers with other ranks, from the thread that calls it.
     is_collective: ClassVar[bool] = False
-    # Whether a function without a plan takes a seed and stored normals, in place of the seed.
-    takes_noise: ClassVar[bool] = False
 
     def __init__(self, system: StateSpaceModel, filter: Filter, form: Form = ONE_RECORD) -> None:
         self.system = system
@@ -68,7 +64,7 @@ class FilterOp(Op):
         """The same operation of another system or filter."""
         return type(self)(system, filter, self.form)
 
-    def compile(self, system: CompiledSystem) -> Compiled | Plan:
+    def compile(self, system: CompiledSystem) -> PlannedFunction | Plan:
         """Compile or plan the function of the inputs."""
         raise NotImplementedError
 
@@ -134,11 +130,7 @@ def evaluator(op: FilterOp) -> Any:
     stores the arguments of a call in cells that all threads would overwrite.
     """
     with COMPILATION:
-        compiled = kernel(op)
-        if isinstance(compiled, PlannedFunction):
-            function: Callable = compiled.loaded()
-        else:
-            function = unplanned.jitted(op, compiled)
+        function = kernel(op).loaded()
     kinds = [np.dtype(_dtype(name)) for name, _ in op.arguments]
     call = TimedCall(function)
 
@@ -161,11 +153,9 @@ def _ready(value: Any, kind: np.dtype) -> np.ndarray:
 
 
 @cache
-def kernel(op: FilterOp) -> Compiled:
+def kernel(op: FilterOp) -> PlannedFunction:
     """The compiled function of an operation, made once."""
     compiled = op.compile(compile_system(op.system))
-    if isinstance(compiled, CompiledFunction):
-        return compiled
     plan = compiled if isinstance(compiled, Plan) else compiled.plan
     return PlannedFunction(plan, op.arguments, op.results)
 
@@ -183,8 +173,4 @@ def theta_cotangent_only(op: Op, inputs: Sequence[Variable], theta_bar: Variable
 def _numba(op: FilterOp, node: Apply | None = None, **kwargs: Any) -> tuple:
     """The compiled function of an operation, and its key."""
     compiled = kernel(op)
-    if isinstance(compiled, PlannedFunction):
-        function, key = compiled.source(), compiled.key
-    else:
-        function, key = unplanned.checked_call(op, compiled)
-    return numba_njit(function), key
+    return numba_njit(compiled.source()), compiled.key

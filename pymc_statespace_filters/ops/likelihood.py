@@ -20,12 +20,12 @@ from pytensor.graph.rewriting.basic import node_rewriter
 from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.rewriting.basic import register_specialize
 
-from ..compiler.codegen.function_types import CompiledFunction
 from ..compiler.lowering.compiled_system import CompiledSystem, compile_system
 from ..compiler.native.plan import Plan
+from ..compiler.native.planned_function import PlannedFunction
 from ..errors import GradientUnavailableError
 from ..facts import Fact, in_words
-from ..filters.protocol import BatchFilter, Compiled, DifferentiableFilter, EnsembleFilter
+from ..filters.protocol import BatchFilter, DifferentiableFilter, EnsembleFilter
 from ..filters.signatures import (
     GRADIENT,
     LIKELIHOOD,
@@ -40,7 +40,6 @@ from ..filters.signatures import (
 )
 from ..filters.written import short_form
 from .base import HEALTH_SIZE, FilterOp, theta_cotangent_only
-from .unplanned import gradients_one_by_one, values_one_by_one
 
 
 class LogLikelihood(FilterOp):
@@ -53,16 +52,12 @@ class LogLikelihood(FilterOp):
     """
 
     signature = LIKELIHOOD
-    takes_noise = True
 
-    def compile(self, system: CompiledSystem) -> Compiled | Plan:
+    def compile(self, system: CompiledSystem) -> PlannedFunction | Plan:
         """The filter's log-likelihood."""
         if self.form != ONE_RECORD and isinstance(self.filter, BatchFilter):
             return self.filter.plan_of_many(system)
-        compiled = self.filter.compile(system)
-        if self.form == PANEL and isinstance(compiled, CompiledFunction):
-            return values_one_by_one(compiled)
-        return compiled
+        return self.filter.compile(system)
 
     def infer_shape(self, node: Apply, input_shapes: Sequence) -> list[tuple]:
         """As many terms as steps, for every point."""
@@ -119,14 +114,11 @@ class LogLikelihoodGradient(FilterOp):
     signature = GRADIENT
     filter: DifferentiableFilter
 
-    def compile(self, system: CompiledSystem) -> Compiled | Plan:
+    def compile(self, system: CompiledSystem) -> PlannedFunction | Plan:
         """Both passes of the filter."""
         if self.form == PANEL and isinstance(self.filter, BatchFilter):
             return self.filter.plan_of_many(system, leaves_tape=True, goes_back=True)
-        compiled = self.filter.compile_gradient(system)
-        if self.form == PANEL and isinstance(compiled, CompiledFunction):
-            return gradients_one_by_one(compiled)
-        return compiled
+        return self.filter.compile_gradient(system)
 
     def infer_shape(self, node: Apply, input_shapes: Sequence) -> list[tuple]:
         """The shape of theta."""
@@ -139,7 +131,7 @@ class TapedLogLikelihood(FilterOp):
     signature = TAPED
     filter: DifferentiableFilter
 
-    def compile(self, system: CompiledSystem) -> Compiled | Plan:
+    def compile(self, system: CompiledSystem) -> PlannedFunction | Plan:
         """The forward pass."""
         if self.form == PANEL and isinstance(self.filter, BatchFilter):
             return self.filter.plan_of_many(system, leaves_tape=True)
@@ -153,7 +145,7 @@ class TapePullback(FilterOp):
     filter: DifferentiableFilter
     infer_shape = LogLikelihoodGradient.infer_shape
 
-    def compile(self, system: CompiledSystem) -> Compiled | Plan:
+    def compile(self, system: CompiledSystem) -> PlannedFunction | Plan:
         """The backward pass."""
         if self.form == PANEL and isinstance(self.filter, BatchFilter):
             return self.filter.plan_of_many(system, goes_back=True)
@@ -219,7 +211,7 @@ class StoredNoise(FilterOp):
     signature = NORMALS
     filter: EnsembleFilter
 
-    def compile(self, system: CompiledSystem) -> Compiled | Plan:
+    def compile(self, system: CompiledSystem) -> PlannedFunction | Plan:
         """The normals, in the filter's layout."""
         return self.filter.stored_noise(system)
 

@@ -6,15 +6,9 @@ import numpy as np
 
 from ..compiler.lowering.compiled_system import CompiledSystem
 from ..compiler.native.plan import Plan
-from ..filters.protocol import (
-    BatchFilter,
-    Compiled,
-    HealthFilter,
-    PredictionFilter,
-    RunFilter,
-    StatesFilter,
-)
-from ..filters.signatures import GOING_ON, POINTS, PREDICTIONS, RESUMED, RUN, STATES, TERM_HEALTH
+from ..compiler.native.planned_function import PlannedFunction
+from ..filters.protocol import BatchFilter, EnsembleFilter, Filter, PredictionFilter
+from ..filters.signatures import GOING_ON, POINTS, PREDICTIONS, RUN, STATES, TERM_HEALTH
 from ..system.model import StateSpaceModel
 from .base import FilterOp
 
@@ -28,32 +22,27 @@ class States(FilterOp):
 
     __props__ = ("system", "filter", "moment")
     signature = STATES
-    filter: StatesFilter
 
-    def __init__(self, system: StateSpaceModel, filter: StatesFilter, moment: str) -> None:
+    def __init__(self, system: StateSpaceModel, filter: Filter, moment: str) -> None:
         super().__init__(system, filter)
         self.moment = moment
 
-    def compile(self, system: CompiledSystem) -> Compiled | Plan:
+    def compile(self, system: CompiledSystem) -> PlannedFunction | Plan:
         """The filter's states."""
         return self.filter.compile_states(system, self.moment)
 
 
 class FilterRun(FilterOp):
-    """Terms and health of the likelihood, and the filtered state at ``wanted`` steps."""
+    """Terms and health of the likelihood, and the filtered state at ``wanted`` steps.
+
+    It goes on from a state of the filter, empty at the start, and has the state that it leaves.
+    """
 
     signature = RUN
-    filter: RunFilter
 
-    def compile(self, system: CompiledSystem) -> Compiled | Plan:
+    def compile(self, system: CompiledSystem) -> PlannedFunction | Plan:
         """The filter's run."""
         return self.filter.compile_run(system)
-
-
-class ResumableRun(FilterRun):
-    """`FilterRun` from a state of the filter, empty at the start, with the state that it leaves."""
-
-    signature = RESUMED
 
 
 class GoingOn(FilterOp):
@@ -68,7 +57,7 @@ class GoingOn(FilterOp):
     def __init__(self, system: StateSpaceModel, filter: BatchFilter) -> None:
         super().__init__(system, filter, POINTS)
 
-    def compile(self, system: CompiledSystem) -> Compiled | Plan:
+    def compile(self, system: CompiledSystem) -> PlannedFunction | Plan:
         """The filter at all points, side by side if it can."""
         return self.filter.plan_of_many(system)
 
@@ -83,9 +72,9 @@ class TermHealth(FilterOp):
     """Terms (J,) of the likelihood, the effective number (J,) behind each, and health (3,)."""
 
     signature = TERM_HEALTH
-    filter: HealthFilter
+    filter: EnsembleFilter
 
-    def compile(self, system: CompiledSystem) -> Compiled | Plan:
+    def compile(self, system: CompiledSystem) -> PlannedFunction | Plan:
         """The filter's health."""
         return self.filter.compile_health(system)
 
@@ -96,6 +85,6 @@ class Predictions(FilterOp):
     signature = PREDICTIONS
     filter: PredictionFilter
 
-    def compile(self, system: CompiledSystem) -> Compiled | Plan:
+    def compile(self, system: CompiledSystem) -> PlannedFunction | Plan:
         """The filter's predictions."""
         return self.filter.compile_predictions(system)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pytensor.graph.traversal import ancestors
 
 from ..errors import ModelError
-from ..filters.protocol import Filter, ResumableFilter
+from ..filters.protocol import Filter
 from ..pymc_model.at_points import GraphsAtPoints
 from ..pymc_model.filter_rows import FilterRows, Record
 from ..pymc_model.inspection import resized
@@ -210,9 +210,6 @@ def _only_variable(model: pm.Model) -> StateSpaceVariable:
 
 def _check_filter(variable: StateSpaceVariable) -> None:
     filter: Any = variable.filter
-    if not isinstance(filter, ResumableFilter):
-        name = type(filter).__name__
-        _refuse(f"a filter that goes on row by row, which {name} cannot: it has no state")
     if filter.noisy and variable.score_from:
         _refuse(
             f"score_from=0 with a noisy filter, got {variable.score_from}: the estimate of the "

@@ -1,6 +1,7 @@
 """Registers how `StateSpaceRV` is drawn, in Python and in numba, and its log-density."""
 
 from collections.abc import Iterator, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,14 @@ from pytensor.link.numba.dispatch.random import numba_core_rv_funcify
 from pytensor.raise_op import CheckAndRaise
 from pytensor.tensor.variable import TensorVariable
 
+from ..compiler.codegen.function_types import jit
 from ..compiler.native.cache_key import key_of
+from ..compiler.native.plan import Refusal
 from ..errors import ModelError
 from ..evaluation.simulate import simulator
+from ..filters.calls import status_of_rows
 from ..filters.signatures import ONE_RECORD, PANEL
 from ..ops.likelihood import LogLikelihood, vectorized
-from ..ops.unplanned import cache_key, check_of_rows, end_of_record, single_record
 from ..system.panel_records import FIRST_INPUT, RECORD, STEP
 from .held_seed import warn_of_held_seed
 from .inspection import state_space_nodes
@@ -28,6 +31,40 @@ from .stepped import warn_of_steps
 from .unused_priors import warn_of_unused_priors
 
 _TOO_SHORT = "score_from must be less than the number of observations, of which there are too few"
+
+
+def _refusal() -> Any:
+    """A compiled function that raises what a status says."""
+    lines = [f"if status == {int(r)}: raise ModelError({r.message!r})" for r in Refusal]
+    scope = {"ModelError": ModelError}
+    exec("def refuse(status):\n" + "".join(f"    {line}\n" for line in lines), scope)
+    return jit(scope["refuse"])
+
+
+_refuse = _refusal()
+
+
+# Made once for all systems of one shape: a fresh one would be compiled by the next call.
+@cache
+def _check_of_rows(n_inputs: int, last_row: int, of_panel: bool) -> Any:
+    """A compiled check of theta, the steps or the rows of a panel, and inputs."""
+
+    @jit
+    def check(theta, rows, inputs):
+        n_records, width = 1, 1
+        if of_panel:
+            n_records, width = theta.shape[0], rows.shape[rows.ndim - 1]
+        n_rows, n_columns = inputs.shape
+        table = rows.copy().reshape(rows.size)
+        _refuse(status_of_rows(table, width, n_records, n_rows, n_columns, n_inputs, last_row))
+
+    return check
+
+
+def _shape_of_rows(op: StateSpaceRV) -> tuple[int, int, bool]:
+    """What `_check_of_rows` has to know of a system, and whether it is a panel."""
+    system = op.system
+    return system.n_input_columns, int(system.observation_uses_inputs), isinstance(op, PanelRV)
 
 
 @draw_in_python.register
@@ -45,7 +82,7 @@ def _draw_in_python(op: StateSpaceRV, rng: np.random.Generator, *arguments: Any)
     )
     is_panel = isinstance(op, PanelRV)
     simulate = simulator(op.system, True).function
-    check = check_of_rows(op.system, of_panel=is_panel)
+    check = _check_of_rows(*_shape_of_rows(op))
     draws = np.empty((*batch, steps.shape[len(batch)], op.system.p))
     for i in np.ndindex(batch):
         parts = [np.require(a[i], requirements=("C", "W")) for a in (theta, steps, inputs)]
@@ -68,10 +105,8 @@ def _single_records(
 
 @numba_core_rv_funcify.register(StateSpaceRV)
 def _draw_in_numba(op: StateSpaceRV, node: Any) -> tuple:
-    compiled = simulator(op.system, True).jitted
-    is_panel = isinstance(op, PanelRV)
-    simulate, check = compiled.function, check_of_rows(op.system, of_panel=is_panel)
-    p = op.system.p
+    compiled, shape, p = simulator(op.system, True).jitted, _shape_of_rows(op), op.system.p
+    simulate, check = compiled.function, _check_of_rows(*shape)
 
     @numba_njit
     def draw_record(rng, theta, steps, inputs, t0, seed):
@@ -85,19 +120,19 @@ def _draw_in_numba(op: StateSpaceRV, node: Any) -> tuple:
         observations, forces = np.empty((rows.shape[0], p)), inputs.copy()
         first = 0
         for record in range(theta.shape[0]):
-            last = end_of_record(rows, first)
-            own, steps, _, pushes = single_record(
-                theta, rows, observations, forces, record, first, last
-            )
-            _, drawn = simulate(rng, own, steps, pushes, t0)
+            last = first + 1
+            while last < rows.shape[0] and rows[last, RECORD] == rows[first, RECORD]:
+                last += 1
+            steps, pushes = rows[first:last, STEP].copy(), forces[rows[first, FIRST_INPUT] :]
+            _, drawn = simulate(rng, theta[record].copy(), steps, pushes, t0)
             for i in range(last - first):  # assigning them as a slice takes a second to compile
                 for a in range(p):
                     observations[first + i, a] = drawn[i, a]
             first = last
         return observations
 
-    draw, what = (draw_panel, "panel") if is_panel else (draw_record, "record")
-    key = key_of(__name__, what, cache_key(op.system, compiled))
+    draw = draw_panel if isinstance(op, PanelRV) else draw_record
+    key = key_of(__name__, repr((shape, p)), compiled.key)
     # PyTensor requires an integer as the cache key of a random variable.
     return draw, None if key is None else int(key[:15], 16)
 

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..compiler.lowering.compiled_system import compile_system
-from ..filters.protocol import BatchFilter, Filter, ResumableFilter, properties
+from ..filters.protocol import BatchFilter, Filter, properties
 from ..filters.state_law import StateLaw
 from ..ops.at_points import FilterAtPoints
 from ..ops.base import FilterOp
-from ..ops.states import GoingOn, ResumableRun
+from ..ops.states import FilterRun, GoingOn
 from ..system.model import StateSpaceModel
 
 Array = NDArray[np.float64]
@@ -44,7 +44,7 @@ class FilterRows:
     def __init__(self, system: StateSpaceModel, filter: Filter) -> None:
         self.filter, self._system = filter, system
         self._together = properties(filter).resumes_many
-        operation: FilterOp = ResumableRun(system, filter)
+        operation: FilterOp = FilterRun(system, filter)
         if self._together:
             assert isinstance(filter, BatchFilter)
             operation = GoingOn(system, filter)
@@ -89,7 +89,6 @@ class FilterRows:
 
     def law_of_state(self, states: Array) -> StateLaw:
         """The law of the system's state at the points, from what the filter has left."""
-        assert isinstance(self.filter, ResumableFilter)
         return self.filter.law_of_state(compile_system(self._system), states)
 
     def _evaluate(

@@ -17,7 +17,7 @@ from ..compiler.lowering.compiled_system import compile_system
 from ..errors import ModelError
 from ..filters import EKF, IPLF
 from ..filters.checks import check_system_and_filter, takes
-from ..filters.protocol import EnsembleFilter, Filter, ToleranceFilter
+from ..filters.protocol import Filter, ToleranceFilter
 from ..filters.signatures import PANEL
 from ..ops.distributed import CallbackLogLikelihood, CallbackLogLikelihoodOfNoise
 from ..ops.likelihood import LogLikelihood, LogLikelihoodOfNoise, StoredNoise
@@ -61,7 +61,7 @@ def with_likelihood_callback(
     for number, node in enumerate(noisy_nodes):
         system, filter = node.op.system, node.op.filter
         steps, seed = node.inputs[1], node.inputs[-1]
-        if seed in names and isinstance(filter, EnsembleFilter):
+        if seed in names:
             stored = pt.dvector(f"{names[seed]}_normals")
             normals[stored] = StoredNoise(system, filter)(steps, seed)
             op: LogLikelihood = CallbackLogLikelihoodOfNoise(system, filter)
@@ -117,11 +117,6 @@ def autoregressive_noise(
                 raise ModelError(
                     "correlation must be None for a panel, whose records keep estimates of their "
                     "own"
-                )
-            if not isinstance(noisy, EnsembleFilter):
-                raise ModelError(
-                    f"correlation needs a filter whose normals can be stored, such as "
-                    f"psf.BootstrapPF(100), got {noisy!r}"
                 )
             compiled = compile_system(system)
             filter = noisy.smooth(compiled)

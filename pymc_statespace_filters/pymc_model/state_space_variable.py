@@ -11,8 +11,6 @@ from ..filters.protocol import (
     DifferentiableFilter,
     Filter,
     PredictionFilter,
-    StatesFilter,
-    check_states_filter,
 )
 from ..ops.at_points import FilterAtPoints
 from ..ops.likelihood import LogLikelihood, TapedLogLikelihood
@@ -34,7 +32,7 @@ class StateSpaceVariable(NamedTuple):
 
     name: str
     system: StateSpaceModel
-    filter: StatesFilter
+    filter: Filter
     dims: tuple[str, str]
     theta: TensorVariable
     steps: TensorVariable
@@ -78,13 +76,13 @@ def smoothing_method(variable: StateSpaceVariable) -> str:
 def with_other_filter(variable: StateSpaceVariable, filter: Filter) -> StateSpaceVariable:
     """The same variable with another filter."""
     check_system_and_filter(variable.system, filter)
-    return variable._replace(filter=check_states_filter(filter))
+    return variable._replace(filter=filter)
 
 
 def states_of(variable: StateSpaceVariable, moment: str) -> FilterAtPoints:
     """Mean, sd and a draw of the state at ``wanted`` steps, effective sample size and health."""
     results = ("mean", "sd", "drawn", "n_effective_wanted", "health")
-    operation = States(variable.system, check_states_filter(variable.filter), moment)
+    operation = States(variable.system, variable.filter, moment)
     return FilterAtPoints(operation, results)
 
 

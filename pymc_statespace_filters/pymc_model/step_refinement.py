@@ -14,7 +14,6 @@ from ..compiler.lowering.compiled_system import compile_system
 from ..compiler.lowering.symbols import call, jacobian_of, symbols_of
 from ..compiler.native.rows import interpreted_at_points
 from ..errors import ModelError
-from ..filters.protocol import EnsembleFilter
 from ..filters.signatures import PANEL
 from ..system.input_columns import divided, with_resets
 from ..system.integrators.substeps import CoupledNoise
@@ -77,8 +76,7 @@ def _halved(node: Any, halvings: int) -> list[list[Variable]]:
             for i, integrator in enumerate(integrators)
         ]
         systems = [system.with_integrator(one, keeps_noises=True) for one in coupled]
-    if isinstance(filter, EnsembleFilter):
-        filter = filter.smooth(compile_system(systems[0]))
+    filter = filter.smooth(compile_system(systems[0]))
     for version in systems:
         filter.check(compile_system(version))
     return [node.op.of(version, filter)(*node.inputs) for version in systems]

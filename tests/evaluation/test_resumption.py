@@ -1,8 +1,5 @@
 """A run that goes on with more rows gives the bits of one run over all of them."""
 
-from dataclasses import dataclass
-from typing import ClassVar
-
 import numpy as np
 import pytest
 import xarray as xr
@@ -111,29 +108,6 @@ def test_a_guided_filter_in_the_same_parts_has_the_same_bits(filter, tmp_path):
         np.testing.assert_array_equal(second["mean"][-1], again["mean"][-1])
 
 
-@dataclass(frozen=True)
-class Stateless:
-    """A filter of a user that goes on from no state."""
-
-    noisy: ClassVar[bool] = False
-    has_gradient: ClassVar[bool] = False
-
-    def check(self, system):
-        pass
-
-    def is_exact_for(self, system):
-        return False
-
-    def compile(self, system):
-        return psf.EKF().compile(system)
-
-    def compile_states(self, system, moment):
-        return psf.EKF().compile_states(system, moment)
-
-    def smoothing_method(self, system):
-        return "none"
-
-
 def other_system():
     return psf.StateSpaceModel(
         transition=lambda x, q, a: [a * x[0] + q[0], x[1]],
@@ -148,7 +122,6 @@ def other_system():
 REFUSED = [
     (psf.EnKF(50), {}, r"got one with filter BootstrapPF"),
     (psf.GuidedPF(50), {}, r"got one with filter BootstrapPF"),
-    (Stateless(), {}, r"^Stateless cannot go on from an earlier run: it has no state that holds"),
     (psf.BootstrapPF(50, resample_below=0.5), {}, r"got one with filter BootstrapPF\(n_particles="),
     (PF, {"seed": 4}, r"got one with seed 3 instead of 4$"),
     (PF, {"t0": 1.0}, r"got one with t0 0.0 instead of 1.0$"),

@@ -171,7 +171,8 @@ def test_states_are_the_path_without_spread():
 
 def test_a_run_is_the_path_without_covariance():
     rows = ROWS[::2]
-    terms, _, mean, cov, members, _ = compiled("compile_run", KNOWN)(theta_of(), *RECORD, rows)
+    run = compiled("compile_run", KNOWN)(theta_of(), *RECORD, rows, np.empty(0))
+    terms, _, mean, cov, members, *_ = run
     np.testing.assert_allclose(terms, terms_of(theta_of()), rtol=1e-12)
     np.testing.assert_allclose(mean, path(theta_of())[rows], rtol=1e-12)
     np.testing.assert_array_equal(cov, np.zeros((5, 2, 2)))
@@ -180,7 +181,8 @@ def test_a_run_is_the_path_without_covariance():
 
 def test_a_path_that_explodes_fails_from_there_on():
     theta = theta_of(stiffness=-1e200)
-    terms, health, mean, cov, *_ = compiled("compile_run", KNOWN)(theta, *RECORD, ROWS)
+    run = compiled("compile_run", KNOWN)(theta, *RECORD, ROWS, np.empty(0))
+    terms, health, mean, cov, *_ = run
     assert np.isfinite(terms[0])
     assert (terms[1:] == -np.inf).all()
     np.testing.assert_array_equal(health[1:], [STATE_NOT_FINITE, 1.0])
@@ -298,11 +300,10 @@ COUNTS = np.array([[4.0, 2.0], [1.0, 3.0], [np.nan, np.nan], [0.0, 1.0]])
 def test_counts_have_their_own_density_and_its_gradient():
     value = compiled("compile", COUNTED)
     record = (10 * np.arange(4), COUNTS, np.zeros((31, 0)), 0.0, 0)
-    noise = (0, np.empty(0))
     theta = np.array([2.0, 3.0])  # k, x0
 
     def total(k, x0):
-        return value(np.array([k, x0]), *record[:-1], noise)[0]
+        return value(np.array([k, x0]), *record)[0]
 
     mean = 3.0 * np.exp(-0.2 * np.arange(4))
     truth = stats.poisson.logpmf(COUNTS[:, 0], mean)

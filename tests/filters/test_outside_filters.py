@@ -1,11 +1,14 @@
-"""Filters from a user's own file, which inherit nothing from the package, work everywhere."""
+"""Filters from a user's own file, three functions each, work everywhere."""
 
+import json
+import os
 import re
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-import arviz as az
 import numpy as np
 import pymc as pm
 import pytensor
@@ -13,17 +16,19 @@ import pytest
 from numba import njit
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.errors import FilterWarning, ModelError
 from pymc_statespace_filters.filters import (
-    CompiledFunction,
     EnsembleFilter,
     Filter,
-    RunFilter,
-    StatesFilter,
+    ParticleFilter,
+    bootstrap,
+    enkf,
+    member_filter,
+    updated,
 )
-from pymc_statespace_filters.ops import at_points
+from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.states import States
-from pymc_statespace_filters.testing import kalman_log_likelihood
-from tests.references.linear_states import linear_states
+from tests.waiting import LIMIT
 
 PAGE = Path(__file__).parents[2] / "docs" / "howto" / "filter.md"
 # One system with everything, inputs included: the filter of the page is compiled for each.
@@ -42,169 +47,245 @@ FORCE = np.array([0.5, -0.2, 0.1, 0.3, 0.0, -0.4, 0.2, 0.6])
 RUN = {"observed": RECORD, "steps": RECORD_STEPS, "inputs": FORCE}
 
 
-def linear(a):
-    """The same system as the arguments of exact references."""
-    return (
-        np.array([[a, 0.1], [0.0, 0.9]]),
-        np.array([[0.5, 0.1], [0.1, 0.3]]),
-        np.array([[1.0, 0.0], [1.0, -1.0]]),
-        np.array([[0.4, 0.1], [0.1, 0.2]]),
-        np.array([0.5, 0.0]),
-        np.array([[1.0, 0.2], [0.2, 0.5]]),
-    )
-
-
-EXACT_RUN = RUN.copy()
-EXACT_RUN["forcing"] = np.column_stack([EXACT_RUN.pop("inputs"), np.zeros(8)])
-
-
-def exact_terms(a):
-    return kalman_log_likelihood(*linear(a), **EXACT_RUN)
-
-
-def exact_states(a, rows):
-    return linear_states(*linear(a), **EXACT_RUN, rows=rows, moment="filtered")
+GIVEN = np.array([0.7]), RECORD_STEPS, RECORD, FORCE[:, np.newaxis], 0.0, 3
 
 
 @pytest.fixture(scope="module")
-def cubature():
-    """The filter of the page "A new filter", from its definitions alone."""
+def page():
+    """What the page "A new filter" defines, in a user's file."""
     cells = re.findall(r"```\{code-cell\} python3\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    definitions = [cell for cell in cells if re.search(r"^(@njit|@dataclass|from )", cell, re.M)]
+    definitions = [cell.partition("\n\n\nfor ")[0] for cell in cells if "@dataclass" in cell]
     namespace = {"__name__": "a_users_file"}
     exec("\n".join(definitions), namespace)
-    return namespace["CubatureKF"]()
+    return namespace
+
+
+@pytest.fixture(scope="module")
+def cubature(page):
+    return page["CubatureKF"]()
+
+
+@njit(error_model="numpy")
+def observe_as_bootstrap(call, j, k, parts):
+    return bootstrap.observe(call, j, k, parts)
 
 
 @dataclass(frozen=True)
-class PlainParticles:
-    """A noisy filter with the least there can be: no members, no states, no stored noise.
+class OwnPF(ParticleFilter):
+    """The bootstrap filter, by a function of one's own."""
 
-    Its function is decorated by numba's own ``njit``, and has no key.
-    """
-
-    n: int
-    noisy: ClassVar[bool] = True
-    has_gradient: ClassVar[bool] = False
-
-    def check(self, system):
-        if system.carried:
-            raise psf.errors.ModelError("no carried states")
-
-    def is_exact_for(self, system):
-        return True
-
-    def compile(self, system):
-        bootstrap = psf.BootstrapPF(self.n).compile(system).function
-
-        @njit
-        def likelihood(theta, steps, observed, inputs, t0, seed):
-            return bootstrap(theta, steps, observed, inputs, t0, seed)
-
-        return CompiledFunction(likelihood)
-
-
-def model_of(filter):
-    with pm.Model() as model:
-        pm.Uniform("a", -1.0, 1.0)
-        psf.StateSpace("d", SYSTEM, filter, **RUN)
-    return model
+    unbiased: ClassVar[bool] = True
+    counts_copies: ClassVar[bool] = True
+    entry: ClassVar = member_filter("own_pf", observe_as_bootstrap)
 
 
 def test_what_an_outside_filter_is(cubature):
-    assert type(cubature).__mro__[1:] == (object,)
     assert isinstance(cubature, Filter)
-    assert isinstance(cubature, RunFilter)
-    assert isinstance(cubature, StatesFilter)
     assert not isinstance(cubature, EnsembleFilter)
-    assert isinstance(PlainParticles(50), Filter)
-    assert not isinstance(PlainParticles(50), StatesFilter)
+    assert isinstance(OwnPF(50), EnsembleFilter)
+    assert cubature.entry.key is not None  # its machine code is kept on disk
 
 
-def test_its_likelihood_is_exact_on_linear_systems(cubature):
-    for a in (0.3, 0.8):
-        terms = psf.log_likelihood(SYSTEM, cubature, {"a": a}, **RUN)
-        np.testing.assert_allclose(terms, exact_terms(a), rtol=1e-9)
+def test_it_is_the_kalman_filter_on_linear_systems(cubature):
+    both = cubature, psf.EKF()
+    run, exact = (psf.run_filter(SYSTEM, f, {"a": 0.7}, **RUN, at="steps") for f in both)
+    for name in ("mean", "sd", "cov", "log_likelihood"):
+        np.testing.assert_allclose(run[name], exact[name], rtol=1e-8, atol=1e-12)
+    assert "particles" not in run
+    operations = (States(SYSTEM, f, "predicted") for f in both)
+    found, exact = (evaluator(operation)(*GIVEN, np.arange(9), 1) for operation in operations)
+    np.testing.assert_allclose(found[:2], exact[:2], rtol=1e-8, atol=1e-12)
+    np.testing.assert_array_equal(found[3], exact[3])  # no particles: infinitely many
+    np.testing.assert_array_equal(found[4], exact[4])
 
 
-def test_its_states_are_exact_on_linear_systems(cubature):
-    run = psf.run_filter(SYSTEM, cubature, {"a": 0.7}, **RUN, at="steps")
-    exact = exact_states(0.7, np.arange(9))
-    np.testing.assert_allclose(run["mean"], exact.mean, rtol=1e-8, atol=1e-12)
-    np.testing.assert_allclose(run["sd"], exact.sd, rtol=1e-8)
-    cov = np.einsum("iaib->iab", exact.cov)
-    np.testing.assert_allclose(run["cov"], cov, rtol=1e-8, atol=1e-12)
-    np.testing.assert_allclose(run["log_likelihood"], exact_terms(0.7), rtol=1e-8, atol=1e-12)
+def test_it_goes_on_with_the_bits_of_one_run(cubature):
+    whole = psf.run_filter(SYSTEM, cubature, {"a": 0.7}, **RUN)
+    tracker = psf.online(SYSTEM, cubature, {"a": 0.7})
+    for cut in range(1, RECORD_STEPS.size):
+        rest = None
+        for rows in (slice(cut), slice(cut, None)):
+            given = {**RUN, "observed": RECORD[rows], "steps": RECORD_STEPS[rows]}
+            rest = psf.run_filter(SYSTEM, cubature, {"a": 0.7}, **given, state=rest)
+        np.testing.assert_array_equal(rest["cov"], whole["cov"][cut:])
+        np.testing.assert_array_equal(rest["filter_state"], whole["filter_state"])
+    last = 0
+    for k, d, mean in zip(RECORD_STEPS.tolist(), RECORD, whole["mean"].values, strict=True):
+        if not np.isnan(d).all():
+            row = tracker.update(d, step=k, inputs=FORCE[last:k])
+            np.testing.assert_array_equal(row.mean, mean)
+            last = k
+
+
+def test_a_panel_is_its_records_one_by_one(cubature):
+    a, panel = np.array([0.2, 0.7, -0.4]), np.repeat([1, 2, 3], 5)
+    given = {"steps": np.tile(RECORD_STEPS, 3), "inputs": FORCE, "panel": panel}
+    found = psf.log_likelihood(SYSTEM, cubature, {"a": a}, np.tile(RECORD, (3, 1)), **given)
+    alone = [psf.log_likelihood(SYSTEM, cubature, {"a": one}, **RUN) for one in a]
+    np.testing.assert_array_equal(np.ravel(found), np.concatenate(alone))
 
 
 def test_it_is_sampled_and_gives_evidence_and_states(cubature):
     # Without numba PyTensor calls the machine code of the likelihood, which is there already.
-    with pytensor.config.change_flags(mode="FAST_COMPILE"), model_of(cubature):
+    with pytensor.config.change_flags(mode="FAST_COMPILE"), pm.Model():
+        pm.Uniform("a", -1.0, 1.0)
+        psf.StateSpace("d", SYSTEM, cubature, **RUN)
         idata = psf.sample_dram(
-            400,
-            tune=200,
-            chains=2,
-            random_seed=3,
-            progressbar=False,
+            400, tune=200, chains=2, random_seed=3, progressbar=False,
             compute_convergence_checks=False,
-        )
+        )  # fmt: skip
         evidence = psf.chib_jeliazkov(idata, random_seed=1)
         states = psf.filtered_states(idata, n_draws=4, random_seed=2)["filtered_states"]
-        with pytest.raises(psf.errors.ModelError, match="does not smooth; take filter="):
+        with pytest.raises(psf.errors.ModelError, match="does not smooth; name a filter that does"):
             psf.smoothed_states(idata)
     assert idata.attrs["exact"]
     grid = np.linspace(-1.0, 1.0, 401)
-    likelihood = np.exp([exact_terms(a).sum() for a in grid])
+    likelihood = np.exp(psf.log_likelihood(SYSTEM, psf.EKF(), {"a": grid}, **RUN).sum(axis=1))
     exact = np.log(np.trapezoid(likelihood, grid) / 2.0)
     assert evidence.log_evidence == pytest.approx(exact, abs=4 * evidence.se + 1e-3)
     assert evidence.se < 0.1
-    chosen = states["draw"].values[0]
-    a = float(idata.posterior["a"].isel(chain=0).sel(draw=chosen))
-    mean = exact_states(a, RECORD_STEPS).mean
+    a = float(idata.posterior["a"].isel(chain=0).sel(draw=states["draw"].values[0]))
+    mean = psf.run_filter(SYSTEM, psf.EKF(), {"a": a}, **RUN)["mean"]
     np.testing.assert_allclose(states["d_mean"].values[0, 0], mean, rtol=1e-6, atol=1e-8)
 
 
-def test_all_records_of_a_panel_share_one_function(cubature, monkeypatch):
-    """It takes seconds to compile."""
-    at_points._without_plan.cache_clear()  # another test may have made it
-    made = []
+def test_functions_that_call_those_of_a_filter_have_its_bits(page):
+    """States, smoothed ones by backward simulation, and what is left at the end."""
+    inflated = page["InflatedEnKF"]
 
-    def function(inputs, outputs, *arguments, _function=pytensor.function, **options):
-        nodes = [out.owner for out in outputs if out.owner] if isinstance(outputs, list) else []
-        made.extend(node for node in nodes if isinstance(node.op, States))
-        return _function(inputs, outputs, *arguments, **options)
+    def run(filter):
+        return psf.run_filter(SYSTEM, filter, {"a": 0.7}, **RUN, seed=3)
 
-    monkeypatch.setattr(pytensor, "function", function)
-    a = np.array([0.2, 0.7, -0.4])
-    with pytensor.config.change_flags(mode="FAST_COMPILE"), pm.Model() as model:
-        pm.Normal("a", shape=3)
-        psf.StateSpace(
-            "d", SYSTEM, cubature, steps=np.tile(RECORD_STEPS, 3), inputs=FORCE,
-            observed=np.tile(RECORD, (3, 1)), panel=np.repeat([1, 2, 3], 5),
+    def smoothed(filter):
+        return evaluator(States(SYSTEM, filter, "smoothed"))(*GIVEN, np.arange(9), 1)[0]
+
+    pairs = [(psf.BootstrapPF(70), OwnPF(70)), (psf.EnKF(70), inflated(70, inflation=1.0))]
+    for built_in, own in pairs:
+        assert run(built_in).identical(run(own).assign_attrs(run(built_in).attrs))
+        np.testing.assert_array_equal(smoothed(built_in), smoothed(own))
+    assert run(inflated(70, inflation=1.3))["sd"][-1, 0] > run(psf.EnKF(70))["sd"][-1, 0]
+
+
+# What a user may write wrongly, and what is said.
+THING = object()
+WRONG = {
+    "returns_number": r"^the functions of 'wrong' do not fit, returns_number returns float64: Unkn",
+    "uses_object": r"^numba cannot compile uses_object of 'wrong': Untyped global name 'THING'",
+    "returns_members": r"^the functions of 'wrong' do not fit, returns_members returns Members",
+}
+
+
+@njit(error_model="numpy")
+def returns_number(call, j, k, parts):
+    return 1.0
+
+
+@njit(error_model="numpy")
+def uses_object(call, j, k, parts):
+    return updated(float(THING.value))
+
+
+@njit(error_model="numpy")
+def returns_members(call):
+    return enkf.start(call)[1].members
+
+
+@njit(error_model="numpy")
+def returns_nan(call, j, k, parts):
+    return updated(np.nan)
+
+
+def own(observe, **functions):
+    """A filter with these functions."""
+    entry = member_filter("wrong", observe, **functions)
+    return dataclass(frozen=True)(type("Own", (ParticleFilter,), {"entry": entry}))(50)
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_numba_cannot_compile_is_named(name):
+    function = globals()[name]
+    is_start = name == "returns_members"
+    filter = own(observe_as_bootstrap, start=function) if is_start else own(function)
+    with pytest.raises(ModelError, match=WRONG[name]):
+        psf.log_likelihood(SYSTEM, filter, {"a": 0.7}, **RUN)
+
+
+@pytest.mark.parametrize("observe", [lambda call, j, k, parts: None, njit(lambda call: None)])
+def test_what_is_no_such_function_is_refused_at_once(observe):
+    with pytest.raises(ModelError, match=r"^observe of the filter 'wrong' must be a func"):
+        own(observe)
+
+
+def test_an_increment_that_is_not_a_number_is_a_failure():
+    with pytest.warns(FilterWarning, match="gave -inf"):
+        terms = psf.log_likelihood(SYSTEM, own(returns_nan), {"a": 0.7}, **RUN)
+    assert np.isneginf(terms).all()
+
+
+FILE = """
+from dataclasses import dataclass
+from typing import ClassVar
+
+from numba import njit
+from pymc_statespace_filters.filters import ParticleFilter, member_filter, updated
+
+SCALE = {scale}
+
+
+@njit(error_model="numpy")
+def scaled(x):
+    return SCALE * x
+
+
+@njit(error_model="numpy")
+def observe(call, j, k, parts):
+    return updated(scaled(call.record.observed[j, 1]))
+
+
+@dataclass(frozen=True)
+class Own(ParticleFilter):
+    entry: ClassVar = member_filter("in_a_file", observe)
+"""
+
+SCRIPT = """
+import json
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.native.entry_point import _compiled
+from own import Own
+from tests.systems import PAIR, PAIR_DATA, STEPS
+
+terms = psf.log_likelihood(PAIR, Own(50), {"a": 0.6}, PAIR_DATA, steps=STEPS)
+print(json.dumps([terms.tolist(), _compiled[Own.entry.symbol].cache_hits]))
+"""
+
+
+def test_a_changed_function_never_meets_its_old_machine_code(tmp_path):
+    """Which another process finds on disk as long as nothing changes that the function reads."""
+    path = os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])])
+    scale, found = np.random.default_rng().uniform(), []
+    for one in (scale, 2 * scale, scale):
+        (tmp_path / "own.py").write_text(FILE.format(scale=one))
+        done = subprocess.run(
+            [sys.executable, "-c", SCRIPT], env=os.environ | {"PYTHONPATH": path},
+            capture_output=True, timeout=LIMIT, text=True, check=False,
         )  # fmt: skip
-        draws = az.from_dict({"posterior": {"a": a[None, None]}})
-        states = psf.filtered_states(draws, model, random_seed=1)["filtered_states"]
-    assert len(made) == 5  # which are the results of one
-    exact = np.concatenate([exact_states(one, RECORD_STEPS).mean for one in a])
-    np.testing.assert_allclose(states["d_mean"].values[0, 0], exact, rtol=1e-6, atol=1e-8)
+        assert done.returncode == 0, done.stderr
+        found.append(json.loads(done.stdout))
+    (first, _), (second, _), again = found
+    np.testing.assert_array_equal(second, 2 * np.array(first))
+    assert again == [first, 1]
+    assert [hits for _, hits in found] == [0, 0, 1]
 
 
-def test_a_noisy_one_without_anything_else_is_sampled_with_fresh_noise():
-    with model_of(PlainParticles(100)):
-        idata = psf.sample_dram(
-            50, tune=50, chains=2, random_seed=3, compute_convergence_checks=False
-        )
-        seeds = idata.sample_stats["d_seed"].values
-        assert np.unique(seeds).size > 2
-        with pytest.raises(
-            psf.errors.ModelError, match=r"gives no states: it has no compile_states"
-        ):
-            psf.filtered_states(idata)
-        with pytest.raises(psf.errors.ModelError, match="correlation needs a filter whose normals"):
-            psf.sample_dram(5, tune=5, chains=1, kernel={"stages": 1, "correlation": 0.9})
+def test_what_changes_before_it_is_compiled_is_an_error():
+    namespace = {"__name__": "a_users_file"}
+    exec(FILE.format(scale=1.0), namespace)
+    namespace["SCALE"] = 2.0
+    with pytest.raises(ModelError, match=r"^the functions of 'in_a_file' refer to some"):
+        psf.log_likelihood(SYSTEM, namespace["Own"](50), {"a": 0.7}, **RUN)
 
 
-@pytest.mark.parametrize("filter", [psf.EKF, PlainParticles, "EKF", None])
+@pytest.mark.parametrize("filter", [psf.EKF, OwnPF, "EKF", None])
 def test_what_is_no_filter_is_refused(filter):
     with pytest.raises(psf.errors.ModelError, match=r"filter must be a filter such as psf.EKF\(\)"):
         psf.log_likelihood(SYSTEM, filter, {"a": 0.5}, **RUN)

@@ -34,6 +34,8 @@ from pymc_statespace_filters.filters.plan import (
     read_system,
     settings_of,
 )
+from pymc_statespace_filters.ops.base import kernel
+from pymc_statespace_filters.ops.likelihood import LogLikelihoodOfNoise
 from tests.systems import PAIR, PAIR_DATA, STEPS, pair
 
 FUNCTIONS = ("initialise", "propagate", "observe", "log_density")
@@ -146,7 +148,7 @@ def test_nothing_behind_the_header_of_a_damaged_plan_is_read():
 
 RECORD_OF_PAIR = {
     "theta": np.array([0.7, 0.2]), "steps": STEPS, "observed": PAIR_DATA,
-    "inputs": np.zeros((STEPS[-1] + 1, 0)), "t0": 0.0, "noise": (3, np.empty(0)),
+    "inputs": np.zeros((STEPS[-1] + 1, 0)), "t0": 0.0, "normals": np.empty(0),
 }  # fmt: skip
 
 
@@ -158,11 +160,11 @@ RECORD_OF_PAIR = {
         ({"steps": STEPS - 1 - STEPS[0]}, 2),
         ({"observed": PAIR_DATA[:-1]}, 5),
         ({"observed": PAIR_DATA[:, :1].copy()}, 5),
-        ({"noise": (3, np.zeros(7))}, 9),
+        ({"normals": np.zeros(7)}, 9),
     ],
 )
 def test_a_record_that_does_not_fit_is_refused_from_python_and_from_compiled_code(change, status):
-    likelihood = psf.BootstrapPF(20).compile(compile_system(PAIR))
+    likelihood = kernel(LogLikelihoodOfNoise(PAIR, psf.BootstrapPF(20)))
     arguments = (RECORD_OF_PAIR | change).values()
     for function in (likelihood, likelihood.function):
         with pytest.raises(psf.errors.ModelError) as error:
@@ -171,7 +173,7 @@ def test_a_record_that_does_not_fit_is_refused_from_python_and_from_compiled_cod
 
 
 def test_python_and_compiled_code_give_the_same_bits():
-    likelihood = psf.BootstrapPF(20).compile(compile_system(PAIR))
+    likelihood = kernel(LogLikelihoodOfNoise(PAIR, psf.BootstrapPF(20)))
     (terms, health), (theirs, state) = (
         function(*RECORD_OF_PAIR.values()) for function in (likelihood, likelihood.function)
     )

@@ -16,7 +16,6 @@ from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.errors import GradientUnavailableError, ModelError
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood, LogLikelihoodGradient
-from pymc_statespace_filters.ops.unplanned import cache_key
 from tests.systems import FORCED, PAIR, PAIR_DATA, STEPS, forced, pair, pair_terms
 
 PF = psf.BootstrapPF(20)
@@ -64,9 +63,8 @@ def test_pickling(dumps):
     restored = pickle.loads(dumps(op))
     assert restored == op
     assert hash(restored) == hash(op)
-    assert cache_key(PAIR, restored.filter.compile(compile_system(restored.system))) == cache_key(
-        PAIR, PF.compile(compile_system(PAIR))
-    )
+    compiled = restored.filter.compile(compile_system(restored.system))
+    assert compiled.key == PF.compile(compile_system(PAIR)).key
 
 
 def test_printing_shows_the_filter_and_no_equations():
@@ -95,10 +93,10 @@ def test_machine_code_on_disk_is_named_by_all_that_is_compiled_in(filter, monkey
     timed = {"transition": CHANGES[-2]["transition"]}  # dt matters where time is asked for
     systems = [PAIR, *(pair(**c) for c in CHANGES if filter.noisy or "carried" not in c)]
     systems += [pair(**timed, dt=0.5), FORCED]
-    keys = [cache_key(s, filter.compile(compile_system(s))) for s in systems]
+    keys = [filter.compile(compile_system(s)).key for s in systems]
     assert None not in keys
     assert len(set(keys)) == len(systems)
-    assert cache_key(pair(), filter.compile(compile_system(pair()))) == keys[0]
+    assert filter.compile(compile_system(pair())).key == keys[0]
 
 
 def test_filters_and_their_settings_have_machine_code_of_their_own():
@@ -109,8 +107,8 @@ def test_filters_and_their_settings_have_machine_code_of_their_own():
         psf.BootstrapPF(20, resampling="multinomial"),
         *(psf.PFEnKF(20, likelihood=w) for w in ("predictive", "weights")),
     ]
-    keys = [cache_key(PAIR, filter.compile(compile_system(PAIR))) for filter in filters]
-    keys.append(cache_key(PAIR, psf.EKF().compile_gradient(compile_system(PAIR))))
+    keys = [filter.compile(compile_system(PAIR)).key for filter in filters]
+    keys.append(psf.EKF().compile_gradient(compile_system(PAIR)).key)
     assert None not in keys
     assert len(set(keys)) == len(filters) + 1
 

@@ -14,7 +14,6 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.written import filter_from, short_form
 from pymc_statespace_filters.parameter_particles.filter_doubts import kept_from
 from pymc_statespace_filters.pymc_model.other_filter import model_with
-from tests.evaluation.test_resumption import Stateless
 from tests.modes import AS_IT_STANDS
 from tests.parameter_particles.autoregression import DATA, STEPS, exact, model
 from tests.sampling.test_filter_check import N, model_of, outcome_of
@@ -130,9 +129,6 @@ def test_what_is_no_filter_for_the_model_is_refused():
         psf.sample_smc(model=model(psf.EKF(), 3), inner=3)
     with pytest.raises(ModelError, match=r"screen must be .* without noise, .* got EnKF"):
         psf.sample_smc(model=model(psf.EKF(), 3), screen=psf.EnKF(20))
-    settings = SMALL | {"data": "sequential"}
-    with pytest.raises(ModelError, match="Stateless cannot: it has no state"):
-        psf.sample_smc(model=model(psf.EKF(), 3), screen=Stateless(), **settings)
     with pm.Model() as other:
         pm.Normal("a")
     with pytest.raises(ModelError, match="inner must be None for a model without"):

@@ -16,7 +16,6 @@ from pymc_statespace_filters.pymc_model.density import ModelDensity
 from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
 from pymc_statespace_filters.smc.merging import merged_log_evidence
 from pymc_statespace_filters.smc.particles import Populations
-from tests.evaluation.test_resumption import Stateless
 from tests.interrupts import interrupt
 from tests.parameter_particles.autoregression import DATA, STEPS, exact, exact_transforms, model
 from tests.systems import FORCED, FREE, counts, pair
@@ -339,7 +338,6 @@ def test_data_that_do_not_come_row_by_row_are_refused():
         with pytest.raises(ModelError, match=rf"data='sequential' needs .*{match}"):
             psf.sample_smc(20, model=build, **SETTINGS)
 
-    refused("Stateless cannot: it has no state", model(Stateless()))
     refused("score_from=0", model(psf.BootstrapPF(20), score_from=2))
     with model(psf.EKF()) as two:
         psf.StateSpace("e", FREE, psf.EKF(), steps=STEPS, observed=DATA)

@@ -6,7 +6,7 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.ops.base import evaluator
-from pymc_statespace_filters.ops.states import ResumableRun
+from pymc_statespace_filters.ops.states import FilterRun
 from pymc_statespace_filters.parallel import threads
 from pymc_statespace_filters.parallel.threads import Pace
 from pymc_statespace_filters.pymc_model.filter_rows import FilterRows, Record
@@ -41,7 +41,7 @@ NOTHING = np.empty((len(THETA), 0))
 
 def one_by_one(system, filter):
     """Terms and states of a run at each point alone."""
-    evaluate = evaluator(ResumableRun(system, filter))
+    evaluate = evaluator(FilterRun(system, filter))
     none = np.empty(0)
     found = [evaluate(theta, *RECORD, np.int64(0), none.astype(int), none) for theta in THETA]
     return np.stack([one[0] for one in found]), np.stack([one[-1] for one in found])

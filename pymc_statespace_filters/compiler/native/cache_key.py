@@ -17,6 +17,8 @@ import numba
 import pytensor
 from pytensor.link.numba.cache import NUMBA_CACHE_PATH
 
+from .outside_code import UnknownValueError, identity_of
+
 # Numba's own index on disk tells processors and versions of Python apart.
 _COMPILERS = (numba.__version__, llvmlite.__version__, pytensor.__version__)
 _THIS = Path(__file__)
@@ -160,7 +162,7 @@ def key_of(module: str, *parts: str | Callable | None) -> str | None:
     """The key of machine code that a module makes; None if it cannot be cached on disk.
 
     It covers the compilers and the sources of all modules of this package that the module reaches
-    by its imports. Modules outside this package are not covered and have no key.
+    by its imports. Other modules have no key, but their functions have, see `outside_code`.
 
     Parameters
     ----------
@@ -168,11 +170,29 @@ def key_of(module: str, *parts: str | Callable | None) -> str | None:
         The ``__name__`` of the module.
     *parts : str, callable or None
         What else identifies the code: texts, the keys of code that it calls (None where that
-        cannot be cached), and functions, which are covered as the module is.
+        cannot be cached), and functions, which are covered as the module is, or by themselves.
     """
     if module not in _SOURCES:
         return None
-    keys = [key_of(p.__module__, p.__qualname__) if callable(p) else p for p in parts]
+    keys = [_key_of_function(part) if callable(part) else part for part in parts]
     if None in keys:
         return None
-    return hashlib.sha256(repr((_COMPILERS, _SOURCES.digest_of(module), keys)).encode()).hexdigest()
+    return _digest(repr((_COMPILERS, _SOURCES.digest_of(module), keys)).encode())
+
+
+def is_outside(function: Callable) -> bool:
+    """Whether a function is of a user's file, not of this package."""
+    return function.__module__ not in _SOURCES
+
+
+def _key_of_function(function: Callable) -> str | None:
+    if not is_outside(function):
+        return key_of(function.__module__, function.__qualname__)
+    try:
+        return _digest(repr(identity_of(function, _known)).encode())
+    except UnknownValueError:
+        return None
+
+
+def _known(function: Callable) -> str | None:
+    return None if is_outside(function) else key_of(function.__module__, function.__qualname__)

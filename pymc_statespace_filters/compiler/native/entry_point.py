@@ -22,13 +22,15 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.core.caching import FunctionCache
 from numba.core.ccallback import CFunc
+from numba.core.errors import NumbaError
 from numba.extending import intrinsic
 from pytensor import config
 from pytensor.link.numba.cache import CACHED_SRC_FUNCTIONS
 
+from ...errors import ModelError
 from ...parallel.signals import held_interrupts
 from ...progress import slow_compilation
-from .cache_key import key_of
+from .cache_key import is_outside, key_of
 from .code_library import InternalLinkageCompiler, with_internal_linkage
 from .jit import FAST_MATH
 
@@ -104,8 +106,7 @@ class EntryPoint:
     name : str
         Part of the symbol, readable in a profile.
     parts : sequence of str, callable or None
-        Identify what the function closes over, see `key_of`. Its module is covered by itself; a
-        function outside this package is not cached on disk.
+        Identify what the function closes over, see `key_of`. Its module is covered by itself.
     needs : sequence of EntryPoint
         What the function calls by symbol.
     returns : numba type, optional
@@ -130,12 +131,29 @@ class EntryPoint:
         self._name = name
         self._arguments = tuple(arguments.values())
         self._needs, self._returns = needs, returns
-        keys = [needed.key for needed in needs]
-        self.key: str | None = key_of(function.__module__, name, *parts, *keys)
+        self._parts = parts, [needed.key for needed in needs]
+        self.key: str | None = self._key()
         self.symbol = f"psf_{name}_{self.key or uuid4().hex}"
 
+    def _key(self) -> str | None:
+        parts, keys = self._parts
+        return key_of(self._function.__module__, self._name, *parts, *keys)
+
     def compile(self) -> None:
-        """Define the symbol in this process; load it from disk if it was compiled before."""
+        """Define the symbol in this process; load it from disk if it was compiled before.
+
+        Raises
+        ------
+        ModelError
+            If something that a user's function refers to is not what it was when this was made, or
+            numba cannot compile it.
+        """
+        parts, _ = self._parts
+        if self._key() != self.key:
+            raise ModelError(
+                f"the functions of {self._name!r} refer to something that has changed since they "
+                "were given; give them again, by the lines that define the filter"
+            )
         if self.symbol in _compiled:
             return
         for needed in self._needs:
@@ -152,7 +170,12 @@ class EntryPoint:
             compiled._cache = _cache(self._function, self.key)
         # LLVM calls Python, where an interrupt would be lost.
         with held_interrupts(), slow_compilation(self._name), _no_garbage_collection():
-            compiled.compile()
+            try:
+                compiled.compile()
+            except NumbaError as error:
+                if outside := [f for f in parts if callable(f) and is_outside(f)]:
+                    raise ModelError(_explained(self._name, outside, error)) from error
+                raise
         llvm.add_symbol(self.symbol, compiled.address)
         _compiled[self.symbol] = compiled
 
@@ -167,6 +190,18 @@ class EntryPoint:
         pointer = types.CPointer
         arguments = (types.intp if isinstance(a, pointer) else a for a in self._arguments)
         return types.ExternalFunction(self.symbol, self._returns(*arguments))
+
+
+def _explained(name: str, functions: Sequence[Any], error: NumbaError) -> str:
+    """Which of a user's functions numba cannot compile, or else what they return."""
+    lines = [line for line in str(error).splitlines() if not line.startswith("Failed in")]
+    returned = []
+    for function in functions:
+        if f"<function {function.__qualname__} at" in str(error):
+            return f"numba cannot compile {function.__name__} of {name!r}: {lines[0]}"
+        for found in function.nopython_signatures[-1:]:  # none if it was not reached
+            returned.append(f"{function.__name__} returns {found.return_type}")
+    return f"the functions of {name!r} do not fit, {', '.join(returned)}: {lines[0]}"
 
 
 def arguments_class(name: str, arguments: Mapping[str, Any], module: str) -> Any:

@@ -92,7 +92,7 @@ class PlannedFunction:
     ----------
     plan : Plan
     arguments : sequence of (str, int)
-        Names and dimensions, see `plan.ARGUMENTS`. ``noise`` is a seed and a vector of normals.
+        Names and dimensions, see `plan.ARGUMENTS`.
     results : sequence of (str, int)
         Names and dimensions, see `plan.SHAPES`; one result is returned as it is.
     """
@@ -100,7 +100,7 @@ class PlannedFunction:
     def __init__(self, plan: Plan, arguments: Names, results: Names) -> None:
         self.plan = plan
         self.arguments, self.results = tuple(arguments), tuple(results)
-        self._given = [ARGUMENTS[argument] for argument in _flat(self.arguments)]
+        self._given = [ARGUMENTS[argument] for argument in self.arguments]
         self._places = [_words_of(argument) for argument in self._given]
         self._shapes = [_shape(name, ndim) for name, ndim in results]
         sizes = {s for _, shape in self._shapes for s, is_slot in shape if is_slot}
@@ -197,10 +197,9 @@ class PlannedFunction:
 
     def source(self) -> Callable:
         """A function for numba to compile, without Python objects besides an intrinsic."""
-        names = [name for name, _ in self.arguments]
-        parts = ", ".join("noise[0], noise[1]" if n == "noise" else n for n in names)
+        names = ", ".join(name for name, _ in self.arguments)
         namespace = {"__name__": __name__, "invoke": _invoke(self, self.plan.symbol)}
-        text = f"def call({', '.join(names)}):\n    return invoke({parts})\n"
+        text = f"def call({names}):\n    return invoke({names})\n"
         exec(compile(text, "<call of a plan>", "exec"), namespace)
         return namespace["call"]
 
@@ -213,14 +212,6 @@ def _address(values: np.ndarray) -> int:
         return values.ctypes.data
 
 
-def _flat(arguments: Names) -> list[tuple[str, int]]:
-    """The arguments with the two parts of a noise in its place."""
-    parts: list[tuple[str, int]] = []
-    for argument in arguments:
-        parts += [("seed", 0), ("normals", 1)] if argument[0] == "noise" else [argument]
-    return parts
-
-
 def _words_of(argument: Argument) -> tuple[int, list[int], bool]:
     """Where an argument goes among all words of a call, and where its shape goes."""
     first = _FIRST[argument.vector]
@@ -228,14 +219,8 @@ def _words_of(argument: Argument) -> tuple[int, list[int], bool]:
 
 
 def _arrays(values: Sequence[Any]) -> list[np.ndarray]:
-    """The arguments of a call, those in tuples too, as arrays; numbers become new ones."""
-    parts: list[Any] = []
-    for value in values:
-        if isinstance(value, tuple):
-            parts += value
-        else:
-            parts.append(value)
-    return [part if type(part) is np.ndarray else np.asarray(part) for part in parts]
+    """The arguments of a call as arrays; numbers become new ones."""
+    return [value if type(value) is np.ndarray else np.asarray(value) for value in values]
 
 
 def _shape(name: str, ndim: int) -> tuple[int, list[tuple[int, bool]]]:
@@ -246,8 +231,7 @@ def _shape(name: str, ndim: int) -> tuple[int, list[tuple[int, bool]]]:
 
 
 def _invoke(planned: PlannedFunction, symbol: str) -> Any:
-    """An intrinsic that makes the call, with arguments in the order of `_flat`."""
-    arguments = _flat(planned.arguments)
+    """An intrinsic that makes the call."""
     arrays = [types.Array(types.float64, ndim, "C") for _, ndim in planned.results]
     returned = types.Tuple(arrays) if len(arrays) > 1 else arrays[0]
 
@@ -257,7 +241,7 @@ def _invoke(planned: PlannedFunction, symbol: str) -> Any:
 
         return returned(*kinds), generate
 
-    names = ", ".join(f"{name}_{i}" for i, (name, _) in enumerate(arguments))
+    names = ", ".join(f"{name}_{i}" for i, (name, _) in enumerate(planned.arguments))
     scope: dict[str, Any] = {"typed": typed}
     exec(f"def invoke(typing_context, {names}): return typed(typing_context, ({names},))", scope)
     return intrinsic(scope["invoke"])

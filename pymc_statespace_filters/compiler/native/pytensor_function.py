@@ -55,8 +55,7 @@ class NativeFunction:
 
     ``example`` holds the inputs of a first call, which determines ``kinds``, shape and dtype, of
     the results. In PyTensor's modes without numba, or if it has a state to update, as of a
-    generator, machine code calls Python instead. ``errors`` surrounds every call from Python, and
-    ``one_at_a_time`` is the lock of others that call the function.
+    generator, machine code calls Python instead. ``errors`` surrounds every call from Python.
     """
 
     def __init__(
@@ -64,11 +63,10 @@ class NativeFunction:
         function: Any,
         example: Sequence[np.ndarray],
         errors: Callable[[], AbstractContextManager] = nullcontext,
-        one_at_a_time: Lock | None = None,
     ):
         self._function, self._errors = function, errors
         # PyTensor functions have one storage for all threads.
-        self._one_at_a_time = one_at_a_time or Lock()
+        self._one_at_a_time = Lock()
         self.example = [np.require(value, requirements=("C", "W")) for value in example]
         shared = [cell.storage[0] for cell in function.input_storage[len(example) :]]
         has_updates = len(function.maker.fgraph.outputs) > len(function.maker.outputs)

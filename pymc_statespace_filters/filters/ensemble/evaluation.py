@@ -35,8 +35,9 @@ class Evaluation(NamedTuple):
     """One evaluation of a filter: all that its functions read.
 
     ``state`` is what the filter goes on from, empty where it starts. ``settings`` are the filter's
-    own, as numbers. ``local`` says which of all members are here: with MPI other ranks have the
-    others, and `reductions` sums over all. ``nothing`` is an empty vector.
+    own, as numbers. A part has ``n_rows`` numbers. ``local`` says which of all members are here:
+    with MPI other ranks have the others, and `reductions` sums over all. ``nothing`` is an empty
+    vector.
     """
 
     plan: np.ndarray
@@ -44,6 +45,7 @@ class Evaluation(NamedTuple):
     record: Record
     state: np.ndarray
     settings: np.ndarray
+    n_rows: int
     noise: Noise
     local: LocalPartition
     resampling: Resampling
@@ -72,7 +74,7 @@ class Members(NamedTuple):
 
 @njit_internal
 def new_members(n, p, local):
-    """Members of equal weight, without states."""
+    """Members of equal weight, n zeros each."""
     N = local.size
     rows, log_w = np.zeros((n + 1, N)), np.empty(N)
     for i in range(N):
@@ -130,7 +132,7 @@ def read_evaluation(plan, record, request, seed):
     elif state.size and not _goes_on(state, plan[PLAN.state_size], record.steps, noise):
         status = np.int64(STATE)
     call = Evaluation(
-        plan=plan, system=system, record=record, state=state, settings=own,
+        plan=plan, system=system, record=record, state=state, settings=own, n_rows=n_rows,
         noise=noise, local=local,
         resampling=resampler(given[6], int(given[7]), plan[PLAN.order], n_rows, local),
         observer=(
@@ -169,6 +171,13 @@ def restore(call, members):
         copy_into(members.X[a], rows[a, local.first : end])
     copy_into(members.log_w, rows[n, local.first : end])
     return np.int64(call.state[0])
+
+
+@njit_internal
+def members_of(call):
+    """The step and the members of the state that the filter goes on from; else -1 and new ones."""
+    members = new_members(call.n_rows, call.system.p, call.local)
+    return restore(call, members) if call.state.size else np.int64(-1), members
 
 
 @njit_internal

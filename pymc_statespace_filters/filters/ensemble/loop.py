@@ -6,18 +6,19 @@ filter that goes on from a state has the bits of one run over all rows.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...compiler.native.entry_point import EntryPoint
 from ...compiler.native.jit import inline_always, njit_internal
 from ...compiler.numerics.normals import FILL_NORMALS
+from ...errors import ModelError
 from ..calls import OK, likelihood_entry
-from ..outcomes import NONE, is_missing
+from ..outcomes import NONE, NOT_A_NUMBER, is_missing
 from ..plan import PLAN, initialise, propagate
 from .callbacks import ENDED, FORECAST, RESAMPLED, UPDATED, emit
-from .evaluation import Members, leave, new_members, read_evaluation, restore, show
+from .evaluation import Members, leave, members_of, read_evaluation, show
 from .noise import initial_normals, process_normals, resampling_normals
 from .origins import effective_number_of_origins, follow_ancestors, new_origins
 from .resampling import resample_if_few
@@ -39,6 +40,12 @@ class Outcome(NamedTuple):
 
 
 @inline_always
+def updated(increment):
+    """The outcome of an update of a single part."""
+    return Outcome(increment, np.inf, np.inf, NONE)
+
+
+@inline_always
 def failed(failure, n_effective=0.0):
     """The outcome of an update that has failed."""
     return Outcome(-np.inf, n_effective, 0.0, failure)
@@ -53,12 +60,12 @@ class Plain(NamedTuple):
 @njit_internal
 def start(call):
     """Draw the members at step 0, or take those of a state; the step, and the parts."""
-    members = new_members(call.system.n, call.system.p, call.local)
-    if call.state.size:
-        return restore(call, members), Plain(members)
-    initialise(call.system, initial_normals(call.noise), call.local.width, members.X)
-    show(call, FORECAST, -1, np.int64(0), members, call.nothing)
-    return np.int64(0), Plain(members)
+    k, members = members_of(call)
+    if k < 0:
+        k = np.int64(0)
+        initialise(call.system, initial_normals(call.noise), call.local.width, members.X)
+        show(call, FORECAST, -1, k, members, call.nothing)
+    return k, Plain(members)
 
 
 @njit_internal
@@ -96,16 +103,16 @@ def member_filter(
     Parameters
     ----------
     name : str
-    observe : njit function ``(call, j, k, parts) -> Outcome``
+    observe : numba function ``(call, j, k, parts) -> Outcome``
         Replaces the forecast members by the analysis of observation j at step k, with normalised
         weights. ``call`` is an `Evaluation`. What it returns, and where it branches, is the same on
-        all ranks.
-    start : njit function ``call -> (k, parts)``, optional
+        all ranks. It raises nothing.
+    start : numba function ``call -> (k, parts)``, optional
         Draws the members at step 0, or takes those of a state. ``parts`` is a named tuple with
         ``members``, a `Members`, and what else the other functions need.
-    advance : njit function ``(call, j, k, last, parts)``, optional
+    advance : numba function ``(call, j, k, last, parts)``, optional
         Moves members from step k to the step ``last`` of row j.
-    resample : njit function ``(call, j, k, n_weighted, parts) -> bool``, optional
+    resample : numba function ``(call, j, k, n_weighted, parts) -> bool``, optional
         Whether members were resampled.
 
     Returns
@@ -113,7 +120,16 @@ def member_filter(
     EntryPoint
         Writes ``terms``, ``n_effective`` of every term, which stays NaN where there is none, and
         ``health`` (see `filters.protocol`).
+
+    Raises
+    ------
+    ModelError
+        If one of them is no numba function of these arguments; by the first evaluation, if numba
+        cannot compile it, or it returns something else.
     """
+    functions = {"start": start, "advance": advance, "observe": observe, "resample": resample}
+    for role, function in functions.items():
+        _check_function(name, role, function)
 
     @njit_internal
     def evaluate(plan, record, request, seed, to):
@@ -121,7 +137,8 @@ def member_filter(
         if status != OK:
             return status
         steps, local, health = record.steps, call.local, to.health
-        health[0], health[1], health[2] = local.n_members, NONE, -1
+        is_alone = local.n_members == 1
+        health[0], health[1], health[2] = np.inf if is_alone else local.n_members, NONE, -1
         if to.state.size:
             to.state[:] = np.nan
         if call.system.failure != NONE:
@@ -139,14 +156,17 @@ def member_filter(
                 to.terms[j] = 0.0
                 continue
             found = observe(call, j, k, parts)
-            n_effective = found.n_effective
-            if origins.own.size and found.failure == NONE:
+            failure = found.failure
+            if failure == NONE and not np.isfinite(found.increment):
+                failure = NOT_A_NUMBER
+            n_effective = np.inf if is_alone else found.n_effective
+            if origins.own.size and failure == NONE:
                 n_distinct = effective_number_of_origins(origins, members.w, local)
                 n_effective = min(n_effective, n_distinct)
             to.n_effective[j] = n_effective
             health[0] = min(health[0], n_effective)
-            if found.failure != NONE:
-                health[1], health[2] = found.failure, j
+            if failure != NONE:
+                health[1], health[2] = failure, j
                 return OK
             to.terms[j] = found.increment
             emit(observer, UPDATED, j, k, members, record.observed[j], ancestors)
@@ -158,6 +178,18 @@ def member_filter(
             leave(k, members, local, to.state)
         return OK
 
-    return likelihood_entry(
-        name, evaluate, (start, advance, observe, resample), needs=(FILL_NORMALS,)
-    )
+    return likelihood_entry(name, evaluate, tuple(functions.values()), needs=(FILL_NORMALS,))
+
+
+_N_ARGUMENTS = {"start": 1, "advance": 5, "observe": 4, "resample": 5}
+
+
+def _check_function(name: str, role: str, function: Any) -> None:
+    """Raise unless it is a numba function of so many arguments, in which no division raises."""
+    given, count = getattr(function, "py_func", None), _N_ARGUMENTS[role]
+    is_right = given is not None and given.__code__.co_argcount == count
+    if not is_right or function.targetoptions.get("error_model") != "numpy":
+        raise ModelError(
+            f"{role} of the filter {name!r} must be a function of {count} arguments, see "
+            f'member_filter, with the decorator numba.njit(error_model="numpy"), got {function!r}'
+        )

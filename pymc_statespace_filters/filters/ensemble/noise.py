@@ -45,6 +45,9 @@ class NoiseSizes(NamedTuple):
     resampling: int
 
 
+NO_NOISE = NoiseSizes(0, 0, 0, 0, 0)
+
+
 class Noise(NamedTuple):
     """Source of one evaluation's normals: ``stored``, or ``seed`` where nothing is stored.
 

@@ -54,6 +54,27 @@ def _row_of_cov(n, n_exact, a, b):
 
 
 @njit_internal
+def read_moments(X, part, n):
+    """Mean (n,) and covariance of a part without exact states."""
+    mean, cov = np.empty(n), np.empty((n, n))
+    for a in range(n):
+        mean[a] = X[a, part]
+        for b in range(a + 1):
+            cov[a, b] = cov[b, a] = X[_row_of_cov(n, 0, a, b), part]
+    return mean, cov
+
+
+@njit_internal
+def write_moments(mean, cov, X, part):
+    """Make these the mean and covariance of a part without exact states."""
+    n = mean.size
+    for a in range(n):
+        X[a, part] = mean[a]
+        for b in range(a + 1):
+            X[_row_of_cov(n, 0, a, b), part] = cov[a, b]
+
+
+@njit_internal
 def draw_of_mixture(w, X, n_exact, order, seed, place, out):
     """A draw of the whole state, that of ``place``."""
     n, part = order.size, choose(w, uniform_at(seed, STATES, place, 0))

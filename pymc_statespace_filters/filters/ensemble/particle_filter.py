@@ -1,4 +1,4 @@
-"""What particle filters share: when and how they resample, and how they smooth."""
+"""What particle filters share: when and how they resample."""
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
@@ -7,9 +7,6 @@ from typing import ClassVar
 from ...compiler.native.entry_point import EntryPoint
 from ...compiler.native.plan import Plan
 from ..protocol import System
-from . import ancestral_smoother, backward_simulation
-from .ancestral_smoother import CARRY_PAST, LAG
-from .backward_simulation import STORE
 from .base import EnsembleFilterBase, check_choice, check_count, check_fraction
 from .hilbert_sort import ORDER_PARTICLES
 from .resampling import SCHEMES, check_sortable, n_normals, smooth_resampling
@@ -51,8 +48,10 @@ class ParticleFilter(EnsembleFilterBase):
         self, system: System, run: EntryPoint, functions: Sequence[str], **others: int | EntryPoint
     ) -> Plan:
         """Return the plan of a function; it follows origins if copies stay equal for good."""
-        follows = int(self.counts_copies and bool(system.undriven_states))
-        return super().plan(system, run, functions, follows_origins=follows, **others)
+        others |= {"follows_origins": int(self.counts_copies and bool(system.undriven_states))}
+        if self.resampling == "sorted":
+            others["order"] = ORDER_PARTICLES
+        return super().plan(system, run, functions, **others)
 
     def smooth(self, system: System) -> "ParticleFilter":
         """Return this filter with an estimate that changes little when its normals do."""
@@ -61,22 +60,3 @@ class ParticleFilter(EnsembleFilterBase):
     def resampling_normals(self) -> int:
         """Return how many normals a resampling takes."""
         return n_normals(self.resampling, self.n_particles)
-
-    def ordering(self) -> EntryPoint | None:
-        """Return the function that sorts particles, if the scheme does."""
-        return ORDER_PARTICLES if self.resampling == "sorted" else None
-
-    def smoother(self, system: System) -> Plan:
-        """Plan backward simulation, or where a step has no density the ancestral smoother."""
-        if system.has_transition_density:
-            return self.observed(system, backward_simulation.SMOOTH, ("propagate",), observer=STORE)
-        updates = int(self.simulates)
-        return self.observed(
-            system, ancestral_smoother.SMOOTH, observer=CARRY_PAST, updates=updates, lag=LAG
-        )
-
-    def smoothing_method(self, system: System) -> str:
-        """Name the method, and the lag if it has one."""
-        if system.has_transition_density:
-            return "backward simulation"
-        return f"ancestries, settled {LAG} observations later"

@@ -117,8 +117,8 @@ def judge(call, guide, observe, k, X, shares):
     resampling = resampler(1.0, 0, none, system.n, local)
     pilot = Evaluation(
         plan=call.plan, system=system, record=record, state=call.nothing, settings=call.settings,
-        noise=noise, local=local, resampling=resampling, observer=(none, none, none),
-        nothing=call.nothing,
+        n_rows=call.n_rows, noise=noise, local=local, resampling=resampling,
+        observer=(none, none, none), nothing=call.nothing,
     )  # fmt: skip
     members, before, paths = new_members(system.n, system.p, local), np.zeros(_N), _paths()
     particles = guided_particles(pilot, members, guide, call.nothing)

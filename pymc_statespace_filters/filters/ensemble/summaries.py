@@ -10,7 +10,7 @@ from ...compiler.native.jit import copy_into, inline_always, njit_internal
 from ...compiler.native.plan import HEALTH_SIZE, N_RESULTS, REQUEST, RESULTS, plan_entry
 from ...compiler.numerics.philox import STATES, uniform_at
 from ..calls import OK, first_unknown, opened, reals_at, wanted_rows
-from ..plan import PLAN
+from ..plan import PLAN, settings_of
 from .callbacks import CALLBACK_ARGUMENTS, PREDICTED, UPDATED, run_observed, searchsorted
 from .evaluation import layout_of
 from .part_moments import choose, draw_of_mixture, mixture_moments
@@ -47,7 +47,7 @@ def _header(call, layout):
     """The integers of the callback."""
     rows, order, plan = wanted_rows(call), layout.order, call.plan
     integers = np.empty(_N_HEADER + rows.size + order.size, np.int64)
-    integers[_PART_ROWS], integers[_MEMBERS] = layout.rows, plan[PLAN.n_members]
+    integers[_PART_ROWS], integers[_MEMBERS] = layout.rows, int(settings_of(plan)[0])
     integers[_ROWS], integers[_LAST_EVENT] = rows.size, plan[PLAN.last_event]
     integers[_SEED], integers[_NEXT] = call.request[REQUEST.draw_seed], 0
     integers[_EXACT], integers[_N] = layout.n_exact, order.size
@@ -66,7 +66,7 @@ def _summarise(integers, reals, event, j, k, X, log_w, d, D, ancestors):
         first = _N_HEADER + header[_ROWS]
         order = carray(integers, (first + header[_N],))[first:]
         to, n_effective = carray(pointer(header[_RESULTS]), (N_RESULTS,), np.int64), np.inf
-        if w.any():
+        if w.size > 1 and w.any():
             n_effective = effective_number(w)
         write_row(to, row, k, header[_EXACT], order, parts, w, n_effective, header[_SEED])
 
@@ -78,7 +78,7 @@ def write_row(to, row, k, n_exact, order, parts, w, n_effective, seed):
     Fewer effective parts leave the variance between them too small, by a factor that is known.
     """
     n, N, R = order.size, w.size, to[RESULTS.n_wanted]
-    if to[RESULTS.members] != 0:
+    if to[RESULTS.members] != 0 and to[RESULTS.n_members] != 0:  # a part that is alone is none
         states = reals_at(to[RESULTS.members], (R, N, n))[row]
         copy_into(reals_at(to[RESULTS.weights], (R, N))[row], w)
         for i in range(N):
