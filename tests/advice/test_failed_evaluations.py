@@ -32,10 +32,11 @@ BENT = psf.StateSpaceModel(
 )
 
 
+PARTICLES = psf.BootstrapPF(100)
 RECORD = (np.empty(0), np.arange(5, 10), np.zeros((5, 1)), np.empty((0, 0)), 5.0, 0)
 
 
-def warned(rows, filter="a filter", system=SYSTEM):
+def warned(rows, filter=PARTICLES, system=SYSTEM):
     asked = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -43,13 +44,14 @@ def warned(rows, filter="a filter", system=SYSTEM):
     return [str(w.message) for w in caught], asked
 
 
-def test_the_worst_evaluation_is_the_one_with_the_fewest_that_did_not_fail():
+def test_the_worst_evaluation_is_the_one_with_the_fewest_that_did_not_fail(monkeypatch):
+    monkeypatch.setattr(health, "_extent", lambda *_: "Some terms")
     failure = Failure.TOO_FAR
     rows = [[5.0, 0.0, -1.0], [2.0, 0.0, -1.0], [0.0, failure, 3.0], [1.25, 0.0, -1.0]]
     (failed, collapsed), asked = warned(rows)
     assert failed == (
-        f"a filter gave -inf in 1 of 4 evaluations, first in row 3, at time 13: {failure.message}. "
-        f"{failure.cure}."
+        "BootstrapPF(100) gave -inf in 1 of 4 evaluations, first in row 3, at time 13: "
+        f"{failure.message}. {failure.cure}."
     )
     assert "in 2 of 4 evaluations (smallest effective number 1.25)" in collapsed
     assert asked == [2, 3]

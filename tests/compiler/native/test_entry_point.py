@@ -82,13 +82,21 @@ def test_a_second_entry_under_the_same_key_is_the_first():
     assert other.symbol != one.symbol
 
 
-def test_functions_outside_the_package_have_no_key():
+def with_constant(value):
+    return lambda x: value
+
+
+def test_an_entry_outside_the_package_has_no_key_and_a_part_from_there_that_of_its_code():
     for parts in ((), ("text",)):
         point = EntryPoint(scale, ARGUMENTS, "s", parts)
         assert point.key is None
         assert point.symbol != EntryPoint(scale, ARGUMENTS, "s", parts).symbol
     inside = of_module(scale, NATIVE)
-    assert EntryPoint(inside, ARGUMENTS, "s", (scale,)).key is None
+    one, same, other = (EntryPoint(inside, ARGUMENTS, "s", (with_constant(c),)) for c in (1, 1, 2))
+    assert one.key == same.key
+    assert one.key != other.key
+    mutable = with_constant([1.0])
+    assert EntryPoint(inside, ARGUMENTS, "s", (mutable,)).key is None
     assert EntryPoint(inside, ARGUMENTS, "s", (None,)).key is None
     assert EntryPoint(inside, ARGUMENTS, "s", needs=(SCALE,)).key is None
     assert not isinstance(cached_on_disk(njit(scale), "text")._cache, FunctionCache)
