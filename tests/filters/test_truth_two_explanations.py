@@ -61,7 +61,7 @@ def check_moments(sensor, n_steps, n_particles, n_seeds):
     record = (np.zeros(0), steps, observed[:, None], np.zeros((0, 0)), 0.0)
     found = np.empty((n_seeds, 3))
     for seed in range(n_seeds):
-        terms, _, _, _, particles, weights = run(*record, seed, steps[-1:])
+        terms, _, _, _, particles, weights, *_ = run(*record, seed, steps[-1:], np.zeros(0))
         moments = [weights[0] @ f(particles[0, :, 0]) for f in FUNCTIONS]
         found[seed] = np.exp(terms.sum()) * np.array(moments)
     exact = exact_moments(numeric, observed, FUNCTIONS)
