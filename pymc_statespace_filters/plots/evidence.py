@@ -7,13 +7,13 @@ from typing import Any
 import pandas as pd
 import xarray as xr
 from arviz_plots import PlotCollection
-from arviz_plots.visuals import line_x, scatter_x, set_xlim
+from arviz_plots.visuals import line_x, scatter_x
 
 from ..errors import ModelError
 from ..evidence import Evidence
 from ..system.checks import shortened
 from .picture import Mark
-from .rows import decimals, ends, format_probability, picture_of_rows
+from .rows import OF_PROBABILITIES, decimals, ends, format_probability, picture_of_rows
 from .shapes import interval
 
 COLUMNS = ("prob", "prob_low", "prob_high", "undecided")
@@ -61,7 +61,7 @@ def plot_evidence(
     >>> collection.savefig("evidence.png")  # doctest: +SKIP
     """
     table = _table(idata_or_table)
-    points, values = table[["log_evidence"]], table["log_evidence"]
+    points = table[["log_evidence"]]
     bars = [
         interval(points - count * table["se"], points + count * table["se"]) for count in (2, 1)
     ]
@@ -72,8 +72,8 @@ def plot_evidence(
             Mark(line_x, "one_se", bars[1], {"width": 4, **STYLE}),
             Mark(scatter_x, "point", points, STYLE),
         ],
-        xr.apply_ufunc(_text, values, table["se"], vectorize=True, output_dtypes=[object]),
-        middle=(values.min() + values.max()).item() / 2,
+        _text,
+        [table["log_evidence"], table["se"]],
         x="log-evidence (nats), 1 and 2 standard errors",
         backend=backend,
         pc_kwargs=pc_kwargs,
@@ -153,12 +153,6 @@ def plot_model_probabilities(
     prob, undecided = data[["prob"]], data["undecided"]
     bounds = interval(*(data[[end]].rename({end: "prob"}) for end in ("prob_low", "prob_high")))
     bar = {**STYLE, "width": 2}
-    texts = xr.apply_ufunc(
-        _shown_probability,
-        *(data[column] for column in COLUMNS),
-        vectorize=True,
-        output_dtypes=[object],
-    )
     return picture_of_rows(
         prob,
         [
@@ -166,10 +160,10 @@ def plot_model_probabilities(
             Mark(scatter_x, "decided", prob.where(~undecided), STYLE, "probability"),
             Mark(scatter_x, "undecided", prob.where(undecided), OPEN, "probability"),
             Mark(ends, "ends", bounds, bar),
-            Mark(set_xlim, None, prob, {"limits": (-0.02, 1.02)}),
         ],
-        texts,
-        middle=0.5,
+        _shown_probability,
+        [data[column] for column in COLUMNS],
+        limits=OF_PROBABILITIES,
         x="probability of the model",
         backend=backend,
         pc_kwargs=pc_kwargs,

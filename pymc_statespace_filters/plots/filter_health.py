@@ -15,7 +15,7 @@ from arviz_stats.ecdf_utils import (
 from scipy.stats import norm
 
 from ..former_names import former_names
-from .over_time import bands_of, median_of, over_draws
+from .over_time import over_draws, spread_of
 from .picture import Mark, picture, titles_of
 from .results import diagnostics_of, time_label
 from .shapes import (
@@ -232,9 +232,10 @@ def _effective(found: xr.Dataset) -> tuple[xr.Dataset, list[Mark]]:
     logs = xr.apply_ufunc(np.log10, effective).to_dataset(name="effective")
     quantiles, limit = over_draws(logs), np.log10(COLLAPSED)
     ends = np.array([min(logs["effective"].min(), limit), logs["effective"].max()])
+    below, above = spread_of(quantiles)
     return logs, [
-        *bands_of(quantiles),
-        median_of(quantiles),
+        *below,
+        *above,
         Mark(hline, "collapsed", xr.Dataset({"effective": limit}), LIMIT, "collapse"),
         Mark(y_ticks, None, logs, logarithmic_ticks(ends)),
     ]

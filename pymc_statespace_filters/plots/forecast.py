@@ -12,17 +12,7 @@ from arviz_plots.visuals import vline
 from ..errors import ModelError
 from ..former_names import former_names
 from ..system.checks import check_count
-from .over_time import (
-    DATA,
-    TRUTH,
-    bands_of,
-    bars_of,
-    connected,
-    median_of,
-    over_draws,
-    picture_over_time,
-    points_of,
-)
+from .over_time import DATA, TRUTH, over_draws, picture_over_time, points_of, spread_of
 from .picture import Mark
 from .results import (
     SAMPLE_DIMS,
@@ -156,7 +146,6 @@ def plot_forecast(
     data = draws.to_dataset(name="observations")
     quantiles = over_draws(data)
     at_one_time = int(quantiles["observations"].notnull().any("quantile").sum("time").max()) == 1
-    quantiles = quantiles if at_one_time else connected(quantiles)
     marks = []
     if errors:
         texts = [f"error of {text}" for text in texts]
@@ -171,10 +160,10 @@ def plot_forecast(
         style = {"color": TRUTH["color"]}
         marks.append(points_of(_later(truth, record, draws), "truth", style, "truth"))
     # Bands below the points, the median above them.
-    bands = bars_of(quantiles) if at_one_time else bands_of(quantiles)
+    below, above = spread_of(quantiles, as_bars=at_one_time)
     return picture_over_time(
         data,
-        [*bands, *marks, *([] if at_one_time else [median_of(quantiles)])],
+        [*below, *marks, *above],
         texts,
         x=time,
         backend=backend,

@@ -63,26 +63,23 @@ def connected(found: xr.Dataset) -> xr.Dataset:
     return found.interpolate_na("time") if "record" in found.dims else found
 
 
-def bands_of(quantiles: xr.Dataset) -> list[Mark]:
-    """Marks of 90 % and 50 % bands over time."""
-    return [
+def spread_of(quantiles: xr.Dataset, *, as_bars: bool = False) -> tuple[list[Mark], list[Mark]]:
+    """Marks of 90 % and 50 % bands, and that of the median, which is above all others.
+
+    Or of bars at separate times, without a median.
+    """
+    if as_bars:
+        return [
+            Mark(bars, f"bar_{prob}", ends, {**DRAWS, "width": WIDTHS[prob]}, f"{prob} %")
+            for prob, ends in _ends(quantiles)
+        ], []
+    quantiles = connected(quantiles)
+    bands = [
         Mark(band, f"band_{prob}", ends, {**DRAWS, "alpha": OPACITIES[prob]}, f"{prob} %")
         for prob, ends in _ends(quantiles)
     ]
-
-
-def bars_of(quantiles: xr.Dataset) -> list[Mark]:
-    """Marks of 90 % and 50 % bars at separate times."""
-    return [
-        Mark(bars, f"bar_{prob}", ends, {**DRAWS, "width": WIDTHS[prob]}, f"{prob} %")
-        for prob, ends in _ends(quantiles)
-    ]
-
-
-def median_of(quantiles: xr.Dataset) -> Mark:
-    """The mark of a median over time."""
     median = quantiles.sel(quantile=0.5, drop=True)
-    return Mark(curve, "median", median, {**DRAWS, "width": 1.5}, "median")
+    return bands, [Mark(curve, "median", median, {**DRAWS, "width": 1.5}, "median")]
 
 
 def points_of(values: xr.DataArray, name: str, style: Mapping[str, Any], key: str) -> Mark:

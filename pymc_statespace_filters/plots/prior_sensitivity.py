@@ -11,11 +11,13 @@ from arviz_plots.visuals import set_xlim, set_xticks, set_ylim
 
 from ..errors import ModelError
 from .picture import Mark, along_models, picture, style_of_curve
+from .rows import OF_PROBABILITIES
 from .shapes import band, curve, interval, logarithmic_ticks
 
 ENDS = ("width_prob_low", "width_prob_high")
 SIZE, NOTE_WIDTH = (6.0, 3.2), 32  # inches of the panel; characters of a line inside it
 LINE = 0.22  # inches, of a line below the panel
+MARGIN = 0.05  # beside the widths, as a share of their range
 
 
 def plot_prior_sensitivity(
@@ -77,13 +79,16 @@ def plot_prior_sensitivity(
     about = _about_priors(probs)
     ticks = logarithmic_ticks(probs["width"].values)
     shown = probs.fillna(0.0)  # a panel without results has axes too
+    ends = found["width"].values[[0, -1]]
+    margin = MARGIN * (ends[1] - ends[0])
     return picture(
         probs,
         [
             Mark(band, "band", interval(low, high), {"alpha": 0.25}, f"{share}interval"),
             Mark(curve, "curve", probs, {"width": 2}, {name: name for name in models}),
-            Mark(set_ylim, None, shown, {"limits": (-0.02, 1.02)}),
+            Mark(set_ylim, None, shown, {"limits": OF_PROBABILITIES}),
             Mark(set_xticks, None, shown, ticks),
+            Mark(set_xlim, None, shown, {"limits": (ends[0] - margin, ends[1] + margin)}),
             *_note_empty(found),
         ],
         x="width of the priors (factor)" + about,
@@ -115,13 +120,8 @@ def _note_empty(found: xr.Dataset) -> list[Mark]:
         return []
     why = found.attrs.get("width_note") or "the draws do not determine it"
     text = "\n".join(fill(line, NOTE_WIDTH) for line in ("no result at any width:", why))
-    ends = found["width"].values[[0, -1]]
-    margin = 0.05 * (ends[1] - ends[0])
-    middle = xr.Dataset({"width_prob": ends.mean()})
-    return [
-        Mark(set_xlim, None, middle, {"limits": (ends[0] - margin, ends[1] + margin)}),
-        Mark(note, "note", middle, {"text": text, "color": "B2"}),
-    ]
+    middle = xr.Dataset({"width_prob": found["width"].values[[0, -1]].mean()})
+    return [Mark(note, "note", middle, {"text": text, "color": "B2"})]
 
 
 def note(da: xr.DataArray, target: Any, *, text: str, color: str, **kwargs: Any) -> Any:

@@ -1,46 +1,54 @@
 """One labelled row for each entry, with its point, intervals and number."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from arviz_plots import PlotCollection
 from arviz_plots.plot_collection import backend_from_object
+from arviz_plots.visuals import set_xlim
 
 from .picture import LETTERS_PER_INCH, LONGEST_NAME, Mark, picture
 
 WIDTH, HEIGHT = 6.4, 0.6  # inches, of the panel and of a row in it
+OF_PROBABILITIES = -0.02, 1.02  # limits of an axis
 END = 0.12  # half the length of the mark at an end of an interval
 
 
 def picture_of_rows(
     points: xr.Dataset,
     marks: Sequence[Mark],
-    texts: xr.DataArray,
+    text: Callable[..., str],
+    columns: Sequence[xr.DataArray],
     *,
-    middle: float,
+    limits: tuple[float, float] | None = None,
     x: str,
     backend: str | None,
     pc_kwargs: Mapping[str, Any],
 ) -> PlotCollection:
     """Draw marks in the row of each entry of the only dimension, the first on top.
 
-    ``texts`` stand above the points, on the side of ``middle``.
+    The ``text`` of the values of ``columns`` stands above a point, towards the middle of the axis,
+    whose ``limits`` are by default those of what is drawn.
     """
-    (dim,) = map(str, points.dims)
+    (dim,), (values,) = map(str, points.dims), points.values()
     places = np.arange(points.sizes[dim])[::-1]
     names = [str(name) for name in points[dim].values]
     for_names = max(0, max(map(len, names), default=0) - LONGEST_NAME) / LETTERS_PER_INCH
     rows = {"places": places, "names": names}
-    beside = {"texts": texts, "middle": middle, "color": "B2"}
+    texts = xr.apply_ufunc(text, *columns, vectorize=True, output_dtypes=[object])
+    ends_of_axis = limits or (values.min().item(), values.max().item())
+    beside = {"texts": texts, "middle": np.mean(ends_of_axis), "color": "B2"}
+    fixed = [] if limits is None else [Mark(set_xlim, None, points, {"limits": limits})]
     return picture(
         points,
         [
             Mark(label_rows, None, points, rows),
             *marks,
             Mark(annotate, "text", points, beside),
+            *fixed,
         ],
         x=x,
         y="",

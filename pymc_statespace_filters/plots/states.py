@@ -15,13 +15,11 @@ from .over_time import (
     DATA,
     DRAWS,
     TRUTH,
-    bands_of,
-    bars_of,
     connected,
-    median_of,
     over_draws,
     picture_over_time,
     points_of,
+    spread_of,
 )
 from .picture import Mark
 from .results import (
@@ -172,13 +170,9 @@ def plot_states(
             Mark(band, "probability", edges, RIBBON, "probability"),
             Mark(tick_values, None, edges),
         ]
-    lines = []
     # Bands below the points, lines above them.
-    if at_observations and data.sizes["time"] <= FEW:
-        marks += bars_of(quantiles)
-    else:
-        marks += bands_of(connected(quantiles))
-        lines = [median_of(connected(quantiles))]
+    below, lines = spread_of(quantiles, as_bars=at_observations and data.sizes["time"] <= FEW)
+    marks += below
     if n_draws:
         are_paths = group != "filtered_states" and not at_observations
         draw, style = (paths, PATHS) if are_paths else (points, DOTS)

@@ -4,11 +4,11 @@ from typing import Any
 
 import xarray as xr
 from arviz_plots import PlotCollection
-from arviz_plots.visuals import line_x, scatter_x, set_xlim
+from arviz_plots.visuals import line_x, scatter_x
 
 from ..errors import ModelError
 from .picture import Mark
-from .rows import decimals, ends, format_probability, picture_of_rows
+from .rows import OF_PROBABILITIES, decimals, ends, format_probability, picture_of_rows
 from .shapes import interval
 
 STYLE = {"color": "C0"}
@@ -64,19 +64,16 @@ def plot_terms(
     error = N_ERRORS * terms["inclusion_se"]
     bounds = interval((points - error).clip(0, 1), (points + error).clip(0, 1))
     prior = terms[["prior_inclusion"]].rename(prior_inclusion="inclusion")
-    texts = xr.apply_ufunc(
-        _text, terms["inclusion"], terms["inclusion_se"], vectorize=True, output_dtypes=[object]
-    )
     return picture_of_rows(
         points,
         [
             Mark(ends, "prior", interval(prior, prior), {"color": "B3", "width": 2}, "prior"),
             Mark(line_x, "interval", bounds, {"width": 2, **STYLE}, "two standard errors"),
             Mark(scatter_x, "point", points, STYLE, "probability"),
-            Mark(set_xlim, None, points, {"limits": (-0.02, 1.02)}),
         ],
-        texts,
-        middle=0.5,
+        _text,
+        [terms["inclusion"], terms["inclusion_se"]],
+        limits=OF_PROBABILITIES,
         x="probability of the term",
         backend=backend,
         pc_kwargs=pc_kwargs,
