@@ -10,7 +10,7 @@ from ..sampling.output.facts import EndedNuts
 from .filter_check import check_filters
 from .missed import missed_of
 from .mixing import mixing_problem, until_ess_problem
-from .remedies import alternatives, reaches_zero, without_transform
+from .remedies import alternatives, reaches_zero, reparametrise, without_transform
 from .words import log, told
 
 # Bayesian fraction of missing information of the energies, below which the tails of one are too
@@ -44,7 +44,7 @@ def _too_short(fact: EndedNuts, instead: str) -> list[str]:
     """Draws that are worth less than was asked for."""
 
     def ways(slowest: str) -> list[str]:
-        return [instead or f"reparametrise {slowest}"]
+        return [instead or reparametrise(fact.names, fact.positions, slowest)]
 
     remedy = ""
     if fact.is_stuck:

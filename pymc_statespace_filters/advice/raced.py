@@ -5,13 +5,10 @@ from ..sampling.run.stopping import expected_iterations
 from .mixing import rounded
 from .words import log, sentences, told
 
-_NAMES = "DRAM", "NUTS, from its points,", "DRAM, from the better points,"
-
 
 @sentences.register
 def _(fact: Raced) -> list[str]:
-    parts = [_outcome(run, fact) for run in fact.runs]
-    return ["; ".join(f"{name} {text}" for name, text in zip(_NAMES, parts, strict=False))]
+    return ["; ".join(f"{_name(run, fact)} {_outcome(run, fact)}" for run in fact.runs)]
 
 
 @told.register
@@ -19,6 +16,12 @@ def _(fact: Raced, begin: str) -> list[str]:
     said = [f"{begin}{text}." for text in sentences(fact)]
     log(said, fact.best.level)
     return said
+
+
+def _name(run: EndedRun, fact: Raced) -> str:
+    if isinstance(run, EndedNuts):
+        return "NUTS, from its points,"
+    return "DRAM" if run is fact.runs[0] else "DRAM, from the better points,"
 
 
 def _outcome(run: EndedRun, fact: Raced) -> str:

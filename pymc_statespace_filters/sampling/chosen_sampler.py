@@ -26,7 +26,7 @@ from .run.request import RunArguments, SamplingRequest
 from .run.stopping import AUTO, target_ess
 
 _SAMPLERS = ("auto", NUTS, DRAM)
-_NAMES = {DRAM: "DRAM", NUTS: "NUTS", BOTH: "DRAM, then NUTS from its points"}
+_NAMES = {DRAM: "DRAM", NUTS: "NUTS", BOTH: "DRAM first"}
 # CPU seconds of each processor, within which chains go on to reach ``until_ess``.
 TIME_LIMIT = 300.0
 
@@ -209,7 +209,9 @@ def _choice(
     if given.draws < FEWEST:
         return Choice(DRAM, "so few draws do not show what they are worth")
     reason = why_dram(model)
-    return Choice(DRAM, reason) if reason else Choice(BOTH, "if it takes too many iterations")
+    if reason:
+        return Choice(DRAM, reason)
+    return Choice(BOTH, "NUTS follows, from its points, if DRAM takes too many iterations")
 
 
 def _request(sampler: str, given: RunArguments) -> SamplingRequest:

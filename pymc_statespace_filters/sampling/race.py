@@ -61,8 +61,6 @@ def race(
     walk(first)
     begin, is_slow = of_model(name), _is_too_slow(runs[0])
     reason = why_not_after_all(model) if is_slow else ""
-    if reason and request.until_ess is not None:
-        unless_interrupted(partial(walk, request), None)
     if is_slow and not reason:
         from .nuts.sample_nuts import sample_nuts  # nutpie takes longer to import than the rest
 
@@ -72,11 +70,11 @@ def race(
             asked = asked._replace(max_draws=min(asked.max_draws, MOST_THIN[NUTS] * asked.draws))
         given = asked, quiet, name, runs[0].positions, _MARGIN * needed / _GRADIENT
         unless_interrupted(partial(sample_nuts, model, *given), None)
-        if request.until_ess is not None and not _is_good(runs[-1], first):
-            unless_interrupted(partial(walk, _again(first, rest(), runs)), None)
+    if is_slow and request.until_ess is not None and not _is_good(runs[-1], first):
+        unless_interrupted(partial(walk, _again(first, rest(), runs)), None)
     best = max(runs, key=lambda run: (_is_good(run, first), _effective(run)))
     raced = Raced(tuple(runs), best, goal)
-    if len(runs) > 1 and not reason:
+    if len(runs) > 1:
         tell(raced, begin)
     tell(replace(best, request=request._replace(tune=best.request.tune)), begin)
     sampler = NUTS if isinstance(best, EndedNuts) else DRAM

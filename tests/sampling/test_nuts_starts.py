@@ -1,4 +1,4 @@
-"""NUTS from points of the user, after Ctrl-C, and on data that were doubted before."""
+"""NUTS from points of the user, after Ctrl-C, on doubted data, and where it diverges."""
 
 import logging
 
@@ -8,7 +8,6 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.sampling.nuts import chains
-from pymc_statespace_filters.sampling.nuts import chains as nuts_chains
 
 STEPS = np.arange(1, 41)
 WALK = psf.StateSpaceModel(
@@ -94,9 +93,6 @@ def at_most(n, convergence):
     return lambda positions: convergence([each[:n] for each in positions])
 
 
-# Chains of NUTS that diverge end where more iterations do not help, and say so.
-
-
 ERRORS = np.array([15.0, 10.0, 16.0, 11.0, 9.0, 11.0, 10.0, 18.0])
 EFFECTS = np.array([28.0, 8.0, -3.0, 7.0, -1.0, 1.0, 18.0, 12.0])
 CALL = {"sampler": "nuts", "random_seed": 1, "progressbar": False}
@@ -122,6 +118,6 @@ def test_a_funnel_ends_the_run_at_the_first_doubling_that_does_not_help(caplog):
 
 
 def test_chains_that_do_not_diverge_go_on_however_little_they_gain(monkeypatch):
-    monkeypatch.setattr(nuts_chains, "_LEAST_GROWTH", 1e6)
+    monkeypatch.setattr(chains, "_LEAST_GROWTH", 1e6)
     tree = psf.sample(100, tune=300, until_ess=395, model=schools(centred=False), **CALL)
     assert tree.attrs["iterations_per_draw"] > 2

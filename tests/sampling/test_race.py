@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pymc as pm
+import pytensor.tensor as pt
 import pytest
 import xarray as xr
 
@@ -28,6 +29,15 @@ def stiff(n=30):
     with pm.Model() as model:
         x = pm.Normal("x", 0, 1, shape=n)
         pm.Normal("y", x @ rotated, 1.0, observed=np.zeros(n))
+    return model
+
+
+def staircase():
+    """Two levels before and after a year, of which 250 iterations of the walk are too few."""
+    years = np.arange(30.0)
+    with pm.Model() as model:
+        year, low, high = pm.Uniform("year", 0, 30), pm.Normal("low"), pm.Normal("high")
+        pm.Normal("y", pt.switch(year > years, low, high), 1.0, observed=np.sin(years) + years / 20)
     return model
 
 
@@ -83,6 +93,16 @@ def test_the_walk_goes_on_where_nuts_diverges(caplog, monkeypatch):
     assert idata.attrs["sampler_reason"] == told.removesuffix(".")
     assert idata.attrs["sampler"] in told.lower()
     assert not any("sampler=" in text or "psf.sample" in text for text in said)
+
+
+def test_the_walk_goes_on_from_its_own_points_where_nuts_cannot_follow(caplog, monkeypatch):
+    monkeypatch.setattr(race, "_WALK", 1)
+    idata, said = run(staircase(), caplog, draws=250)
+    assert idata.attrs["sampler"] == "dram"
+    assert idata.attrs["sampler_reason"] == "the likelihood is a staircase of year"
+    (told,) = (text for text in said if "DRAM, from the better points, made draws worth" in text)
+    assert told.startswith("DRAM would take some")
+    assert not any("NUTS, from its points, " in text for text in said[1:])
 
 
 @pytest.mark.parametrize("most", [500.0, 3000.0, np.inf])

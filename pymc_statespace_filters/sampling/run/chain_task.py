@@ -52,9 +52,7 @@ class ChainTask:
     n_rows: InitVar[int]  # draws, with those of the warm-up, that it may have after `extend`
     mixture: InitVar[np.ndarray]  # packed, of the first proposals
     thin: InitVar[int] = 1  # iterations after the warm-up of which one draw, the last, is kept
-    proposal_cov: InitVar[np.ndarray | None] = (
-        None  # of the first proposals: by default the target's
-    )
+    proposal_cov: InitVar[np.ndarray | None] = None  # of the first; by default the target's
     index: int = 0
     name: str = "chain 0"  # for messages
     stored: InitVar[Stored | None] = None
