@@ -7,7 +7,7 @@ import numpy as np
 from numba import carray
 
 from ..compiler.native.entry_point import EntryPoint, pointer
-from ..compiler.native.jit import njit_callable, njit_internal
+from ..compiler.native.jit import copy_into, njit_callable, njit_internal
 from ..compiler.native.plan import (
     DAMAGED,
     HEALTH_SIZE,
@@ -252,19 +252,19 @@ def likelihood_entry(
         n_points, to = call.results[RESULTS.n_points], call.results
         terms = reals_at(to[RESULTS.terms], (n_points * n_rows,))
         healths = reals_at(to[RESULTS.health], (n_points, HEALTH_SIZE))
-        if is_panel:
-            healths[0, 0], healths[0, 1], healths[0, 2] = np.inf, NONE, -1
+        of_panel = np.array([np.inf, float(NONE), -1.0])
+        # What stays if machine code raises, as where memory ends.
+        terms[:] = -np.inf
+        for i in range(n_points):
+            healths[i, 0], healths[i, 1], healths[i, 2] = 0.0, OUT_OF_MEMORY, 0.0
         first, before = np.int64(0), np.int64(0)
         for number in range(call.record[RECORD.n_records]):
-            last = end_of_record(call, first)
-            health = np.empty(HEALTH_SIZE) if is_panel else healths[number]
+            last, health = end_of_record(call, first), healths[0 if is_panel else number]
             own = terms[before + first : before + last]
             numbers = np.empty(own.size)
             if to[RESULTS.n_effective] != 0:
                 numbers = reals_at(to[RESULTS.n_effective] + _BYTES * first, (own.size,))
-            own[:], numbers[:] = -np.inf, np.nan
-            # What stays if memory ends.
-            health[0], health[1], health[2] = 0.0, OUT_OF_MEMORY, 0.0
+            numbers[:] = np.nan
             status = evaluate(
                 call.plan, single_record(call, number, first, last), call.request,
                 _seed(call, first), Terms(own, numbers, health, state_wanted(call)),
@@ -272,10 +272,12 @@ def likelihood_entry(
             if status != OK:
                 return status
             if is_panel:
-                include_health(healths[0], health, first)
+                include_health(of_panel, health, first)
                 first = last
             else:
                 before += n_rows
+        if is_panel:
+            copy_into(healths[0], of_panel)
         return OK
 
     return plan_entry(run, name, (evaluate, *parts), needs)

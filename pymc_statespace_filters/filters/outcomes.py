@@ -84,6 +84,7 @@ class Failure(OutcomeCode):
         "are sensors without noise; if they do, give an initial_cov of at most 1e8 times "
         "observation_noise, and use units in which states and observables have similar sizes",
     )
+    EXCEPTION = 14, "a function of the filter raised an exception, which Python wrote to stderr"
 
     @property
     def has_row(self) -> bool:
@@ -103,7 +104,7 @@ _WITHOUT_ROW = (
 (
     RAISED, NOT_A_NUMBER, NONE, STATE_NOT_FINITE, COVARIANCE_NOT_POSITIVE, ZERO_DENSITY,
     NO_PROCESS_NOISE, GRID_TOO_LARGE, OUT_OF_MEMORY, TOO_FAR, INITIAL_COV, PROCESS_NOISE,
-    OBSERVATION_NOISE, OBSERVATION_UNDEFINED, INVALID_PROBABILITY, SINGULAR,
+    OBSERVATION_NOISE, OBSERVATION_UNDEFINED, INVALID_PROBABILITY, SINGULAR, EXCEPTION,
 ) = map(int, Failure)  # fmt: skip
 
 

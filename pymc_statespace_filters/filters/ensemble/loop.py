@@ -10,12 +10,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...compiler.native.cache_key import is_outside
 from ...compiler.native.entry_point import EntryPoint
 from ...compiler.native.jit import inline_always, njit_internal
 from ...compiler.numerics.normals import FILL_NORMALS
 from ...errors import ModelError
 from ..calls import OK, likelihood_entry
-from ..outcomes import NONE, NOT_A_NUMBER, is_missing
+from ..outcomes import EXCEPTION, NONE, NOT_A_NUMBER, OUT_OF_MEMORY, is_missing
 from ..plan import PLAN, initialise, propagate
 from .callbacks import ENDED, FORECAST, RESAMPLED, UPDATED, emit
 from .evaluation import Members, leave, members_of, read_evaluation, show
@@ -130,6 +131,8 @@ def member_filter(
     functions = {"start": start, "advance": advance, "observe": observe, "resample": resample}
     for role, function in functions.items():
         _check_function(name, role, function)
+    # Where machine code raises, nothing but what was written before is left.
+    if_raised = EXCEPTION if any(map(is_outside, functions.values())) else OUT_OF_MEMORY
 
     @njit_internal
     def evaluate(plan, record, request, seed, to):
@@ -138,7 +141,7 @@ def member_filter(
             return status
         steps, local, health = record.steps, call.local, to.health
         is_alone = local.n_members == 1
-        health[0], health[1], health[2] = np.inf if is_alone else local.n_members, NONE, -1
+        health[0], health[1], health[2] = np.inf if is_alone else local.n_members, if_raised, 0
         if to.state.size:
             to.state[:] = np.nan
         if call.system.failure != NONE:
@@ -149,6 +152,7 @@ def member_filter(
         members, observer, nothing = parts.members, call.observer, call.nothing
         ancestors = call.resampling.ancestors
         for j in range(steps.size):
+            health[2] = j
             if k < steps[j]:
                 advance(call, j, k, steps[j], parts)
                 k = steps[j]
@@ -176,6 +180,7 @@ def member_filter(
         emit(observer, ENDED, steps.size, k, members, nothing, ancestors)
         if to.state.size:
             leave(k, members, local, to.state)
+        health[1], health[2] = NONE, -1
         return OK
 
     return likelihood_entry(name, evaluate, tuple(functions.values()), needs=(FILL_NORMALS,))
