@@ -17,6 +17,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters import several_models
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
 from pymc_statespace_filters.sampling.checkpoint.record_file import RecordFile, header_of
+from pymc_statespace_filters.sampling.output.facts import EndedDram
 from pymc_statespace_filters.sampling.run import model_result
 from pymc_statespace_filters.sampling.run.model_task import ModelTask
 from pymc_statespace_filters.sampling.run.request import RunArguments, SamplingRequest
@@ -174,13 +175,13 @@ def test_a_result_takes_little_more_than_twice_its_memory(monkeypatch):
             pm.Normal(name)
     highest = []
 
-    def before_the_checks(*arguments):
+    def before_the_checks(**facts):
         highest.append(tracemalloc.get_traced_memory()[1])
-        return []
+        return EndedDram(**facts)
 
     settings = SETTINGS | {"draws": 40_000, "chains": 4}
     psf.sample_dram(model=model, **SETTINGS)
-    monkeypatch.setattr(model_result, "tell", before_the_checks)
+    monkeypatch.setattr(model_result, "EndedDram", before_the_checks)
     thresholds = gc.get_threshold()
     gc.set_threshold(700, 10, 10)  # a user's, not those of the tests
     tracemalloc.start()
