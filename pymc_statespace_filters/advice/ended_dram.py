@@ -4,7 +4,7 @@ from functools import partial
 
 from ..checks.filters.filter_facts import UsedFilters
 from ..parallel.signals import is_interrupted
-from ..pymc_model.missing_codes import has_missing_codes
+from ..pymc_model.inspection import have_missing_codes
 from ..sampling.output.datatree import most_iterations
 from ..sampling.output.facts import EndedDram, WithoutDraws
 from .collapse import collapse_remedies
@@ -42,7 +42,7 @@ def _(fact: EndedDram, begin: str) -> list[str]:
         said += _mixing(fact)
     said += _left_out(fact)
     report = closing_report(fact) if fact.chains else ""
-    problems = said or check.warned or is_interrupted() or has_missing_codes(fact.model)
+    problems = said or check.warned or is_interrupted() or have_missing_codes(fact.model)
     if report and fact.is_checked and not problems:
         report += " No problems found."
     log([begin + text for text in said])

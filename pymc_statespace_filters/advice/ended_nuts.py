@@ -4,7 +4,7 @@ import numpy as np
 
 from ..checks.filters.filter_facts import UsedFilters
 from ..parallel.signals import is_interrupted
-from ..pymc_model.missing_codes import has_missing_codes
+from ..pymc_model.inspection import have_missing_codes
 from ..sampling.output.convergence import MAX_RHAT
 from ..sampling.output.facts import EndedNuts
 from .filter_check import check_filters
@@ -32,7 +32,7 @@ def _(fact: EndedNuts, begin: str) -> list[str]:
     said = [*_problems(fact, instead), *missed, *_too_short(fact, instead)]
     report = _report(fact)
     is_good = fact.convergence is not None and fact.convergence.rhat.max() <= MAX_RHAT
-    if is_good and not (said or is_interrupted() or has_missing_codes(fact.model)):
+    if is_good and not (said or is_interrupted() or have_missing_codes(fact.model)):
         report += " No problems found."
     log([begin + text for text in said])
     log([begin + report], fact.level)

@@ -24,10 +24,14 @@ class InputRows(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Terms (m,) of a row at m points, failure codes (m,), and mean and covariance of the state."""
+    """Terms (m,) of a row at m points, failure codes (m,), and mean and covariance of the state.
+
+    ``n_particles`` (m,) are effective numbers of particles behind the terms.
+    """
 
     terms: Array
     codes: Array
+    n_particles: Array
     mean: Array
     cov: Array
 
@@ -130,7 +134,7 @@ class _Point:
             mean, cov = moments_of_members(in_own_units(self._system, members), weights)
         else:
             mean, cov = law_in_own_units(self._system, mean, cov)
-        return Step(terms.copy(), health[1:2].astype(np.int64), mean, cov)
+        return Step(terms.copy(), health[1:2].astype(np.int64), health[:1].copy(), mean, cov)
 
     def keep(self, chosen: NDArray[np.bool_] | None = None) -> None:
         """Stand behind the last row."""
@@ -201,7 +205,7 @@ class _SideBySide:
         mean, cov = law.moments()
         if self._system.drifting:
             mean, cov = law_in_own_units(self._system, mean, cov)
-        return Step(terms[:, 0], health[:, 1].astype(np.int64), mean, cov)
+        return Step(terms[:, 0], health[:, 1].astype(np.int64), health[:, 0], mean, cov)
 
     def keep(self, chosen: NDArray[np.bool_] | None = None) -> None:
         """Stand behind the last row at the chosen points."""

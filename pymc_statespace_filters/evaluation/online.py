@@ -39,12 +39,16 @@ class Row(NamedTuple):
     cov : ndarray, shape (n, n)
     n_effective : float
         Effective number of draws of the parameters, 1 of a single point.
+    n_particles : float
+        Effective number of particles behind the row, at the draw where it is smallest. Below 3 the
+        filter has collapsed: give it more particles. Infinite without particles.
     """
 
     log_likelihood: float
     mean: Array
     cov: Array
     n_effective: float
+    n_particles: float
 
 
 class Prediction(NamedTuple):
@@ -132,7 +136,7 @@ class OnlineFilter:
         """
         datum = self._checked(observed)
         place, points, found = self._evaluated(datum, step, time, inputs)
-        terms, codes, mean, cov = found
+        terms, codes, n_particles, mean, cov = found
         if len(codes) > 1:
             return self._mixed(datum, place, points, found)
         if codes[0] != NONE:
@@ -140,7 +144,7 @@ class OnlineFilter:
         points.keep()
         self._points = points
         self._steps.passed(place, datum)
-        return Row(float(terms[0]), mean[0], cov[0], 1.0)
+        return Row(float(terms[0]), mean[0], cov[0], 1.0, float(n_particles[0]))
 
     def advance(
         self, *, step: int | None = None, time: float | None = None, inputs: Any = None
@@ -166,7 +170,7 @@ class OnlineFilter:
 
     def _mixed(self, datum: Array, place: Place, points: FilterSteps, found: Step) -> Row:
         """The row of several draws."""
-        terms, codes, mean, cov = found
+        terms, codes, n_particles, mean, cov = found
         is_alive = codes == NONE
         if not is_alive.any():
             raise _without_likelihood(place, codes)
@@ -174,7 +178,8 @@ class OnlineFilter:
         log_likelihood = self._stand(place, points, is_alive, log_weights, datum)
         weights = np.exp(self._log_weights)
         moments = _mixture(weights, mean[is_alive], cov[is_alive])
-        return Row(log_likelihood, *moments, float(1.0 / np.square(weights).sum()))
+        n_effective = float(1.0 / np.square(weights).sum())
+        return Row(log_likelihood, *moments, n_effective, float(n_particles[is_alive].min()))
 
     def _stand(
         self,
@@ -201,7 +206,7 @@ class OnlineFilter:
         return self._predicted(place, found)
 
     def _predicted(self, place: Place, found: Step) -> Prediction:
-        _, codes, mean, cov = found
+        _, codes, _, mean, cov = found
         is_alive = codes == NONE
         if not is_alive.any():
             raise _failed(f"there is no prediction at step {place.step}", codes)
@@ -235,7 +240,7 @@ def online(
     params: Mapping[str, Any],
     *,
     state: OnlineState | None = None,
-    t0: float = 0.0,
+    t0: float | None = None,
     random_seed: int | np.random.Generator | None = None,
 ) -> OnlineFilter:
     """Make a filter that takes the rows of a record as they come.
@@ -249,10 +254,10 @@ def online(
         and draw (a declared parameter's own shape comes last). Draws are a mixture with equal
         weights at the start, which follow the likelihood of the rows.
     state : OnlineState, optional
-        The ``state`` of another online filter of this system, filter and parameters, to go on from,
-        with its ``t0`` and its noise.
-    t0 : float
-        The time of step 0, where ``initial_mean`` and ``initial_cov`` hold.
+        The ``state`` of another online filter of this system, filter and parameters, to go on from.
+        It has its own ``t0`` and noise.
+    t0 : float, optional
+        The time of step 0, where ``initial_mean`` and ``initial_cov`` hold. Default: 0.
     random_seed : int or numpy.random.Generator, optional
         Of the noise inside the filter.
 
@@ -266,7 +271,7 @@ def online(
     ------
     ModelError
         If the filter cannot treat the system or cannot go on from a state, parameters do not fit,
-        or the state is of another system, filter or parameters.
+        or the state is of another system, filter or parameters or comes with `t0` or `random_seed`.
 
     Notes
     -----
@@ -306,11 +311,14 @@ def online(
             raise ModelError("state must be of the same system and filter, got one of another")
         if state.identity != identity:
             raise ModelError("state must be of the same parameters, got one of others")
+        for name, value in {"t0": t0, "random_seed": random_seed}.items():
+            if value is not None:
+                raise ModelError(f"{name} must be None with state, which has its own")
         return OnlineFilter(system, filter, state)
     rng = check_random_seed(random_seed)
     seeds = rng.integers(np.iinfo(np.int64).max, size=len(theta))
     weights = np.full(len(theta), -math.log(len(theta)))
-    t0, resets = check_finite("t0", t0), np.zeros(len(system.accumulators))
+    t0, resets = check_finite("t0", 0.0 if t0 is None else t0), np.zeros(len(system.accumulators))
     nothing = [np.empty(0)] * len(theta)
     start = OnlineState(identity, theta, seeds, weights, nothing, -1, t0, t0, resets, True)
     return OnlineFilter(system, filter, start)

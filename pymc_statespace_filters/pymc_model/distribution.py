@@ -31,7 +31,6 @@ from ..system.parameters import (
 from ..system.record import Record, check_seed, check_system, read_record
 from ..system.timed_inputs import TimedInputs
 from . import dispatch as dispatch  # registers draw and density
-from .missing_codes import warn_of_missing_codes
 from .random_variable import NUMBERS, PanelRV, StateSpaceRV, make_seed
 from .record_dimensions import in_order_of_records
 from .unused_priors import warn_of_no_data
@@ -195,7 +194,6 @@ class StateSpace(Continuous):
         # A symbol, because PyMC would mask and impute the NaN of an array.
         data = None if record.observed is None else pt.as_tensor(record.observed)
         warn_of_no_data(name, data)
-        warn_of_missing_codes(name, data, system.observables)
         _add_coord(model, row_dim, row_coords, name)
         _add_coord(model, component_dim, list(system.observables), name)
         if panel is not None:

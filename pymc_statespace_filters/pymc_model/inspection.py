@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 from pytensor.compile.sharedvalue import SharedVariable
-from pytensor.graph.basic import Variable
+from pytensor.graph.basic import Constant, Variable
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.basic import Join
 from pytensor.tensor.shape import SpecifyShape
@@ -19,6 +19,7 @@ from ..errors import ModelError
 from ..filters.protocol import Filter
 from ..filters.written import short_form
 from ..ops.likelihood import LogLikelihood
+from ..system.missing_codes import has_missing_codes
 from ..system.panel_records import RECORD
 from .random_variable import PanelRV, StateSpaceRV
 
@@ -73,6 +74,14 @@ def check_observed(model: pm.Model) -> None:
                 f"it observed=..., use pm.observe(model, {{{name!r}: data}}), or draw it with "
                 "pm.sample_prior_predictive"
             )
+
+
+def have_missing_codes(model: pm.Model) -> bool:
+    """Whether data of a model have a number that may stand for a missing value."""
+    observed = [model.rvs_to_values[node.outputs[1]] for node in state_space_nodes(model).values()]
+    known = [value.get_value() for value in observed if isinstance(value, SharedVariable)]
+    known += [value.data for value in observed if isinstance(value, Constant)]
+    return any(map(has_missing_codes, known))
 
 
 def panel_variables(model: pm.Model) -> list[str]:

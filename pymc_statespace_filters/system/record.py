@@ -25,6 +25,7 @@ from .clock import Clock
 from .given_record import GivenRecord
 from .input_columns import check_inputs, only_seen, warn_of_gaps_in_sums
 from .labels import table_of
+from .missing_codes import warn_of_missing_codes
 from .model import StateSpaceModel
 from .panel_records import ALONE, FIRST_INPUT, STEP, Records, records_of
 from .placement import Earlier
@@ -174,6 +175,7 @@ def _read_data(observed: Any, system: StateSpaceModel, n_rows: int) -> Any:
     if observed is None or (isinstance(observed, Variable) and not is_shared):
         return observed
     data = check_observed(observed.get_value() if is_shared else observed, system, n_rows)
+    warn_of_missing_codes(system, data)
     warn_of_gaps_in_sums(system, data)
     return observed if is_shared else data
 

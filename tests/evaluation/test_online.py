@@ -33,6 +33,19 @@ ONE_STATE = psf.StateSpaceModel(
 )
 
 
+def test_a_row_tells_how_many_particles_are_behind_it():
+    def effective(filter, params, datum):
+        row = psf.online(ONE_STATE, filter, params, random_seed=1).update(datum, step=0)
+        return row.n_particles
+
+    assert effective(psf.EKF(), {"a": 0.9}, 0.3) == np.inf
+    assert effective(psf.EKF(), {"a": np.array([0.9, 0.4])}, 0.3) == np.inf
+    near, far = (effective(psf.BootstrapPF(50), {"a": 0.9}, datum) for datum in (0.3, 20.0))
+    assert 10 < near < 50
+    assert far < 1.01
+    assert effective(psf.BootstrapPF(50), {"a": np.array([0.9, 0.4])}, 20.0) < 1.01
+
+
 def run_of(system, filter, params, data, tracker, **record):
     seed = int(tracker.state.seeds[0])
     return psf.run_filter(system, filter, params, data, seed=seed, **record)

@@ -112,6 +112,13 @@ def test_a_state_of_something_else_is_refused():
             psf.online(system, filter, params, state=state)
 
 
+@pytest.mark.parametrize("own", [{"t0": 0.0}, {"random_seed": 1}])
+def test_a_state_has_its_own_start_and_noise(own):
+    state = psf.online(ONE_STATE, psf.EKF(), {"a": 0.9}).state
+    with pytest.raises(ModelError, match=f"{next(iter(own))} must be None with state"):
+        psf.online(ONE_STATE, psf.EKF(), {"a": 0.9}, state=state, **own)
+
+
 def test_a_state_of_exchanged_parameters_is_refused():
     line = psf.StateSpaceModel(
         transition=lambda x, q, a, b: [a * x[0] + b + q[0]], process_noise=[[0.5]],

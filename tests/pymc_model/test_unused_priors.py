@@ -162,6 +162,13 @@ def test_a_code_in_data_that_can_be_set_is_named():
         observe(with_codes(TEMPERATURES, [0], -999.0), lambda data: pm.Data("seen", data))
 
 
+def test_a_code_is_named_without_a_model():
+    observed = np.column_stack([TEMPERATURES, with_codes(TEMPERATURES, [3], -999.0)])
+    steps = range(1, len(observed) + 1)
+    with pytest.warns(ModelWarning, match="speed = -999 in row 3"):
+        psf.log_likelihood(PAIR, psf.EKF(), {"a": 0.5}, observed, steps=steps)
+
+
 @pytest.mark.parametrize(
     "column",
     [

@@ -1,18 +1,15 @@
 """A warning of numbers in data that probably stand for a missing value, such as -999."""
 
 import warnings
-from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pymc as pm
 from numpy.typing import NDArray
-from pytensor.compile.sharedvalue import SharedVariable
-from pytensor.graph.basic import Constant
 
-from ..errors import ModelWarning
-from .held_seed import INSIDE
-from .inspection import state_space_nodes
+from ..errors import INSIDE, ModelWarning
+
+if TYPE_CHECKING:
+    from .model import StateSpaceModel
 
 # An end of the data is this many times the range of all others away from them, and, where no number
 # is negative, farther than their range of logarithms: growth and decay have large ratios.
@@ -24,32 +21,22 @@ _CODES = (99.0, 999.0, 9999.0, 99999.0)
 _LEAST_DIFFERENT = 5
 
 
-def warn_of_missing_codes(name: str, observed: Any, observables: Sequence[str]) -> None:
+def warn_of_missing_codes(system: "StateSpaceModel", observed: NDArray[np.float64]) -> None:
     """Warn of a number in the data (J, p) that lies far from all others."""
-    for observable, column in zip(observables, _columns(observed), strict=False):
+    for name, column in zip(system.observables, observed.T, strict=True):
         if (far := _far_number(column)) is not None:
             warnings.warn(
-                f"observed of {name!r} has {observable} = {far:g} in "
-                f"{_rows(np.flatnonzero(column == far))}, more than {_factor(far):g} times the "
-                "range of all other numbers away from them. If it stands for a missing value, put "
-                "NaN there",
+                f"observed has {name} = {far:g} in {_rows(np.flatnonzero(column == far))}, more "
+                f"than {_factor(far):g} times the range of all other numbers away from them. If it "
+                "stands for a missing value, put NaN there",
                 ModelWarning,
                 skip_file_prefixes=INSIDE,
             )
 
 
-def has_missing_codes(model: pm.Model) -> bool:
-    """Whether the data of a model have such a number."""
-    observed = (model.rvs_to_values[model[name]] for name in state_space_nodes(model))
-    columns = (column for data in observed for column in _columns(data))
-    return any(_far_number(column) is not None for column in columns)
-
-
-def _columns(observed: Any) -> Sequence[NDArray[np.float64]]:
-    """What each observable has seen, if it is known."""
-    if isinstance(observed, SharedVariable):
-        return list(observed.get_value().T)
-    return list(observed.data.T) if isinstance(observed, Constant) else []
+def has_missing_codes(observed: NDArray[np.float64]) -> bool:
+    """Whether data (J, p) have such a number."""
+    return any(_far_number(column) is not None for column in observed.T)
 
 
 def _far_number(column: NDArray[np.float64]) -> float | None:
