@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import is_dataclass, replace
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -151,11 +152,23 @@ class EvidenceEstimates(dict[str, Evidence]):
     def __repr__(self) -> str:
         # Doubts are sentences: in a column they would push the errors off the screen.
         table = self.to_dataframe().drop(columns="doubts").to_string()
-        doubts = [f"{name}: {e.doubts}" for name, e in self.items() if e.doubts]
-        return "\n".join([table, self._verdict(), *doubts])
+        return "\n".join([table, self._verdict(), *self._doubts()])
 
     def _repr_html_(self) -> str:
-        return f"{self.to_dataframe().to_html()}<p>{self._verdict()}</p>"
+        table = self.to_dataframe().drop(columns="doubts").to_html()
+        lines = [self._verdict(), *self._doubts()]
+        return table + "".join(f"<p>{escape(line, quote=False)}</p>" for line in lines)
+
+    def _doubts(self) -> list[str]:
+        """What is doubtful, once, behind the names of the estimates that share it."""
+        sharers: dict[str, list[str]] = {}
+        for name, one in self.items():
+            for doubt in filter(None, one.doubts.split("; ")):
+                sharers.setdefault(doubt, []).append(name)
+        shared: dict[str, list[str]] = {}
+        for doubt, names in sharers.items():
+            shared.setdefault(", ".join(names), []).append(doubt)
+        return [f"{names}: {'; '.join(doubts)}" for names, doubts in shared.items()]
 
     def _verdict(self) -> str:
         if sum(np.isfinite(e.se) for e in self.values()) < 2:

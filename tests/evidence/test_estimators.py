@@ -173,6 +173,18 @@ class TestAgreement:
         assert found.agreement.diagnosis in found._repr_html_()
 
 
+def test_a_doubt_about_several_estimates_is_shown_once():
+    doubts = {"a": "the chains disagree; few terms", "b": "the chains disagree; R-hat < 2"}
+    shown = EvidenceEstimates(
+        {name: replace(evidence(name, -4.1, 0.25), doubts=text) for name, text in doubts.items()}
+    )
+    lines = ["a, b: the chains disagree", "a: few terms", "b: R-hat < 2"]
+    assert repr(shown).splitlines()[-3:] == lines
+    html = shown._repr_html_()
+    assert html.count("the chains disagree") == 1
+    assert "R-hat &lt; 2" in html
+
+
 def test_a_long_doubt_does_not_hide_the_errors():
     doubtful = Evidence(-4.0, 0.125, "b", 2, 10, -3.0, "0c5f", doubts="the chains disagree " * 9)
     shown = repr(EvidenceEstimates({"a": evidence("a", -4.1, 0.25), "b": doubtful}))
