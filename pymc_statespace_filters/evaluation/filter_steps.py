@@ -11,7 +11,7 @@ from ..filters.protocol import BatchFilter, Filter, properties
 from ..ops.base import evaluator, kernel
 from ..ops.states import FilterRun, GoingOn
 from ..system.model import StateSpaceModel
-from ..system.own_units import in_own_units, law_in_own_units, moments_of_members
+from ..system.own_units import law_in_own_units, run_in_own_units
 
 Array = NDArray[np.float64]
 
@@ -105,7 +105,8 @@ class _Point:
         t0: float,
         before: Array,
     ) -> None:
-        self._system, self._is_in_own_units = system, bool(system.drifting)
+        self._system, self._filter = system, filter
+        self._is_in_own_units = bool(system.drifting)
         self._function = kernel(FilterRun(system, filter)).loaded()
         self._inputs = _Inputs(system.n_input_columns)
         self._step, self._datum = np.zeros(1, dtype=np.int64), np.zeros((1, system.p))
@@ -127,13 +128,13 @@ class _Point:
         if self._call is None or is_moved:
             self._call = self._bound()
         self._call()
-        terms, health, mean, cov, members, weights, _ = self._results
-        if not self._is_in_own_units:
-            mean, cov = mean.copy(), cov.copy()
-        elif weights.shape[1]:
-            mean, cov = moments_of_members(in_own_units(self._system, members), weights)
+        terms, health, mean, cov, members, weights, left = self._results
+        if self._is_in_own_units:
+            points = self._filter.law_of_state(compile_system(self._system), left[None]).are_points
+            law = mean, cov
+            mean, cov, _ = run_in_own_units(self._system, law, members, weights, are_points=points)
         else:
-            mean, cov = law_in_own_units(self._system, mean, cov)
+            mean, cov = mean.copy(), cov.copy()
         return Step(terms.copy(), health[1:2].astype(np.int64), health[:1].copy(), mean, cov)
 
     def keep(self, chosen: NDArray[np.bool_] | None = None) -> None:

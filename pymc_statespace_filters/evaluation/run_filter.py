@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from ..compiler.lowering.compiled_system import compile_system
 from ..compiler.numerics.philox import seeds_of_records
 from ..errors import ModelError
 from ..filters.checks import check_choice
@@ -19,7 +20,7 @@ from ..system.clock import Clock
 from ..system.given_record import GivenRecord
 from ..system.input_columns import resets_at, with_resets
 from ..system.model import StateSpaceModel
-from ..system.own_units import in_own_units, law_in_own_units, moments_of_members
+from ..system.own_units import run_in_own_units
 from ..system.parameters import panel_parameters
 from ..system.placement import Earlier
 from ..system.record import check_seed, read_record
@@ -165,7 +166,11 @@ def run_filter(
     terms, health, *states, left = (list(results) for results in zip(*runs, strict=True))
     tell_of_health(system, filter, np.array(health), lambda i: arguments[i], labels=labels)
     row_dim, term_dim = ("time", "obs_time") if panel is None else ("row", "obs")
-    dataset = _dataset(system, row_dim, *map(np.concatenate, states))
+    are_points = (
+        bool(system.drifting)
+        and filter.law_of_state(compile_system(system), left[0][np.newaxis]).are_points
+    )
+    dataset = _dataset(system, row_dim, *map(np.concatenate, states), are_points=are_points)
     dataset = dataset.assign(log_likelihood=(term_dim, np.concatenate(terms)))
     dataset = dataset.assign(stored(left, labels))
     if properties(filter).finds_path and state is None:
@@ -202,14 +207,12 @@ def _dataset(
     cov: np.ndarray,
     members: np.ndarray,
     weights: np.ndarray,
+    *,
+    are_points: bool,
 ) -> xr.Dataset:
     """States along ``dim``, with members if the filter has any."""
-    if system.drifting:
-        members = in_own_units(system, members)
-        if weights.shape[1]:
-            mean, cov = moments_of_members(members, weights)
-        else:
-            mean, cov = law_in_own_units(system, mean, cov)
+    law = mean, cov
+    mean, cov, members = run_in_own_units(system, law, members, weights, are_points=are_points)
     variances = np.diagonal(cov, axis1=1, axis2=2)
     found: dict[str, tuple] = {
         "mean": ((dim, "state"), mean),

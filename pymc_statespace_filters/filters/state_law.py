@@ -48,6 +48,11 @@ class StateLaw(NamedTuple):
     n_exact: int
     order: NDArray[np.int64]
 
+    @property
+    def are_points(self) -> bool:
+        """Whether the parts are exact states."""
+        return self.n_exact == self.order.size
+
     def drawn(self, rng: np.random.Generator) -> Array:
         """One state (m, n) at each point; NaN where no part is finite."""
         m, n, n_parts = len(self.parts), self.order.size, self.log_weights.shape[1]

@@ -57,6 +57,27 @@ def law_in_own_units(system: "StateSpaceModel", mean: Array, cov: Array) -> tupl
     return moments_in_own_units(system, mean, sd)[0], found
 
 
+def run_in_own_units(
+    system: "StateSpaceModel",
+    law: tuple[Array, Array],
+    members: Array,
+    weights: Array,
+    *,
+    are_points: bool,
+) -> tuple[Array, Array, Array]:
+    """Means (T, n), covariances and members (T, N, n) of a run, from those that a filter has.
+
+    Members that are points give the moments. Where they have covariances of their own, as of
+    `RBPF`, or there are none, the whole law counts as normal.
+    """
+    if not system.drifting:
+        return *law, members
+    members = in_own_units(system, members)
+    if are_points and weights.shape[1]:
+        return *moments_of_members(members, weights), members
+    return *law_in_own_units(system, *law), members
+
+
 def moments_of_members(members: Array, weights: Array) -> tuple[Array, Array]:
     """Means (T, n) and covariances (T, n, n), over 1 - sum w^2, of weighted members (T, N, n)."""
     spread = 1.0 - (weights**2).sum(axis=1)

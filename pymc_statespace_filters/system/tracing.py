@@ -337,7 +337,10 @@ def _whole_start(functions: Functions, symbols: Symbols) -> tuple[Start, TensorV
     numbers = starts(drifting, values)
     mean = pt.concatenate([start.mean, numbers])
     draw = None if start.draw is None else pt.concatenate([start.draw, numbers])
-    return replace(start, mean=mean, draw=draw), bordered(cov, len(drifting), 0.0)
+    given = start.given
+    if given is not None:
+        given = replace(given, entries=pt.concatenate([given.entries, numbers]))
+    return replace(start, mean=mean, draw=draw, given=given), bordered(cov, len(drifting), 0.0)
 
 
 def _steps(functions: Functions, symbols: Symbols) -> tuple[TensorVariable, TensorVariable]:

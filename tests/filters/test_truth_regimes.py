@@ -316,6 +316,26 @@ def test_particles_of_regimes_with_starts_times_and_inputs():
     assert (abs(draws[:, 2].mean(axis=0) - mean) < 4 * sd / 20).all()
 
 
+def test_a_drifting_parameter_varies_within_particles():
+    """Each particle has a normal law of it, nearly as wide as the whole one."""
+    system = psf.drifting(
+        switching(
+            transition=lambda x, q, u, trend: [
+                of(FACTOR, q[0]) * x[0] + of(SHIFT, q[0]) + u[0] + trend + q[1], q[0]
+            ]
+        ),
+        trend=psf.RandomWalk(),
+    )  # fmt: skip
+    params, filter = PARAMS | {"trend": 0.2, "trend_strength": 0.3}, psf.RBPF(500)
+    run = psf.run_filter(system, filter, params, OBSERVED, seed=1, **RECORD)
+    left = run["filter_state"].values[np.newaxis]
+    _, (cov,) = filter.law_of_state(compile_system(system), left).moments()
+    np.testing.assert_allclose(run["cov"].values[-1], cov, atol=0.01)
+    assert cov[2, 2] > 0.1
+    row = psf.online(system, filter, params, random_seed=1).update(0.5, step=4, inputs=INPUTS[:4])
+    assert row.cov[2, 2] > 0.1
+
+
 def test_variances_between_few_particles_are_unbiased():
     """Over 1 - sum w^2: of the regime all variance is between particles."""
     run = psf.run_filter(SYSTEM, psf.RBPF(8), PARAMS, OBSERVED, **RECORD, seed=1)
