@@ -15,9 +15,9 @@ from benchmarks.measure import Peers, Row, compare
 from benchmarks.ours import machine_code
 from benchmarks.systems import SYSTEMS, theta_of
 from benchmarks.timing import Timed
-from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
-from pymc_statespace_filters.filters import signatures
-from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.ops import signatures
+from pymc_statespace_filters.ops.base import kernel
+from pymc_statespace_filters.ops.likelihood import LogLikelihood, TapedLogLikelihood, TapePullback
 
 N_RECORDS = 100
 STEPS = np.arange(0, 1000, 20)
@@ -59,10 +59,10 @@ class Panel:
 
     def alone(self, *, gradient: bool) -> Timed:
         """The functions of a single record, one record after the other."""
-        compiled = compile_system(self.system)
-        forward = self.filter.compile_taped if gradient else self.filter.compile
-        forward = forward(compiled).function
-        reverse = self.filter.compile_pullback(compiled).function if gradient else None
+        forward, reverse = (
+            kernel(kind(self.system, self.filter)).function
+            for kind in (TapedLogLikelihood if gradient else LogLikelihood, TapePullback)
+        )
 
         @numba.njit
         def run(theta, rows, observed, inputs):

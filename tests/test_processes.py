@@ -15,7 +15,8 @@ import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.ops.base import kernel
+from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from tests.systems import FORCED, FORCED_DATA, PAIR, PAIR_DATA, STEPS, forced_terms
 from tests.waiting import LIMIT
 
@@ -107,8 +108,9 @@ import json, sys
 import numpy as np, pymc as pm
 import pymc_statespace_filters as psf
 from pytensor.link.numba.cache import NUMBA_CACHE_PATH
-from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.native import entry_point as entries
+from pymc_statespace_filters.ops.base import kernel
+from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from tests.systems import FORCE, FORCED_DATA, STEPS, forced
 
 def terms(system, observed):
@@ -123,7 +125,7 @@ first, *others = json.loads(sys.argv[1])
 drawn = psf.simulate(forced(), {"a": 0.6}, steps=STEPS, inputs=FORCE, random_seed=1)
 values = [
     terms(*first), drawn["observations"].values.tolist(),
-    psf.EKF().compile(compile_system(forced())).key,
+    kernel(LogLikelihood(forced(), psf.EKF())).key,
 ]
 found = [entry.cache_hits for entry in entries._compiled.values()]
 files = sorted(path.name for path in NUMBA_CACHE_PATH.rglob("*.nb[ci]"))
@@ -168,7 +170,7 @@ def test_machine_code_is_found_again_and_never_mixed_up(run):
     )
     assert same_machine_code == machine_code
     assert found_again == [1] * len(found)
-    assert key == psf.EKF().compile(compile_system(FORCED)).key
+    assert key == kernel(LogLikelihood(FORCED, psf.EKF())).key
     assert warm == cold
     exact = forced_terms(0.6, other_data, observation_noise=0.6)
     np.testing.assert_allclose(other, exact, rtol=1e-12)

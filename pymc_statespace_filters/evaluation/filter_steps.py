@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..compiler.lowering.compiled_system import compile_system
-from ..filters.protocol import BatchFilter, Filter, properties
+from ..filters.protocol import DifferentiableFilter, Filter, properties
 from ..ops.base import evaluator, kernel
 from ..ops.states import FilterRun, GoingOn
 from ..system.model import StateSpaceModel
@@ -65,7 +65,11 @@ def filter_steps(
 
     Before the first row nothing is left: arrays of length 0.
     """
-    if len(theta) > 1 and properties(filter).resumes_many and isinstance(filter, BatchFilter):
+    if (
+        len(theta) > 1
+        and properties(filter).resumes_many
+        and isinstance(filter, DifferentiableFilter)
+    ):
         return _SideBySide(system, filter, theta, t0, left)
     points = [
         _Point(system, filter, own, seed, t0, before)
@@ -181,7 +185,7 @@ class _SideBySide:
     """All points in one call of machine code, of a filter without noise."""
 
     def __init__(
-        self, system: StateSpaceModel, filter: BatchFilter, theta: Array, t0: float,
+        self, system: StateSpaceModel, filter: DifferentiableFilter, theta: Array, t0: float,
         left: list[Array],
     ) -> None:  # fmt: skip
         self._system, self._filter = system, filter

@@ -11,11 +11,11 @@ from ..compiler.numerics.philox import seeds_of_records
 from ..errors import DataMismatchError, ModelError
 from ..filters.checks import check_choice
 from ..filters.outcomes import COLLAPSED, NONE
-from ..filters.protocol import BatchFilter, Filter
-from ..filters.signatures import PANEL, POINTS
+from ..filters.protocol import DifferentiableFilter, Filter
 from ..ops.base import HEALTH_SIZE, evaluator
 from ..ops.distributed import check_ranks, distributed_evaluator
 from ..ops.likelihood import LogLikelihood
+from ..ops.signatures import PANEL, POINTS
 from ..parallel.communicator import Communicator, communicator_of
 from ..system.checks import check_count
 from ..system.given_record import GivenRecord
@@ -184,8 +184,8 @@ def _at_points(
     check_ranks(filter, ranks.size)
     if ranks.size > 1:
         _check_agreement(ranks, filter, (points, *arguments, seeds))
-    if len(points) > 1 and isinstance(filter, BatchFilter):
-        # A filter with batches is deterministic: any seed will do.
+    if len(points) > 1 and isinstance(filter, DifferentiableFilter):
+        # A filter with a gradient is deterministic: any seed will do.
         evaluate = evaluator(LogLikelihood(system, filter, POINTS))
         terms, health = evaluate(points, *arguments, seeds[0])
     else:

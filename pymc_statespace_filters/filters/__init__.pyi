@@ -16,7 +16,6 @@ from .iplf import IPLF
 from .pf_enkf import PFEnKF
 from .plan import initialise, log_density, propagate, simulate
 from .protocol import (
-    BatchFilter,
     DifferentiableFilter,
     EnsembleFilter,
     Filter,
@@ -34,7 +33,6 @@ __all__ = [
     "IPLF",
     "RBPF",
     "UKF",
-    "BatchFilter",
     "BootstrapPF",
     "DifferentiableFilter",
     "EnKF",

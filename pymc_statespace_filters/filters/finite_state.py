@@ -9,7 +9,6 @@ import numpy as np
 from ..compiler.lowering.finite_states import Declared, FiniteStates, finite_states
 from ..compiler.native.entry_point import EntryPoint
 from ..compiler.native.plan import Plan
-from ..compiler.native.planned_function import PlannedFunction
 from ..errors import ModelError
 from ..system.checks import is_integer
 from .markov_chain.backward import BACKWARD
@@ -19,7 +18,6 @@ from .markov_chain.predictions import PREDICTIONS_OF_CHAIN
 from .markov_chain.states import FILTERED, MOMENTS, STATES_OF_CHAIN
 from .plan import make_plan
 from .protocol import System, check_sensor_has_noise
-from .signatures import PREDICTIONS, RUN, STATES
 from .state_law import StateLaw, law_of_values
 from .taped import TapedFilter
 
@@ -143,30 +141,32 @@ class FiniteStateFilter(TapedFilter):
         return is_smooth_in_parameters(system.model)
 
     def plan_of_pass(
-        self, system: System, *, leaves_tape: bool = False, goes_back: bool = False
+        self,
+        system: System,
+        *,
+        of_many: bool = False,
+        leaves_tape: bool = False,
+        goes_back: bool = False,
     ) -> Plan:
         """Plan a pass along a record; one that leaves a tape and goes back is the gradient."""
         return self._plan(system, BACKWARD if goes_back else FORWARD, leaves_tape=leaves_tape)
 
-    def compile_states(self, system: System, moment: str) -> PlannedFunction:
-        """Compile "predicted", "filtered", "smoothed" or "most probable" states."""
-        plan = self._plan(system, STATES_OF_CHAIN, last_event=MOMENTS[moment])
-        return PlannedFunction(plan, *STATES)
+    def plan_of_states(self, system: System, moment: str) -> Plan:
+        """Plan "predicted", "filtered", "smoothed" or "most probable" states."""
+        return self._plan(system, STATES_OF_CHAIN, last_event=MOMENTS[moment])
 
-    def compile_run(self, system: System) -> PlannedFunction:
-        """Compile one run: its members are all states, and their weights the probabilities."""
+    def plan_of_run(self, system: System) -> Plan:
+        """Plan one run: its members are all states, and their weights the probabilities."""
         n_states = len(self._finite_states(system).joint)
-        plan = self._plan(system, STATES_OF_CHAIN, n_members=n_states, last_event=FILTERED)
-        return PlannedFunction(plan, *RUN)
+        return self._plan(system, STATES_OF_CHAIN, n_members=n_states, last_event=FILTERED)
 
     def law_of_state(self, system: System, states: np.ndarray) -> StateLaw:
         """Return the law of the state, from what the filter leaves (m, S) at m points."""
         return law_of_values(states, table_of_states(self._finite_states(system), system.n))
 
-    def compile_predictions(self, system: System) -> PlannedFunction:
-        """Compile the law of every observation given those before it."""
-        plan = self._plan(system, PREDICTIONS_OF_CHAIN, functions=("observe",))
-        return PlannedFunction(plan, *PREDICTIONS)
+    def plan_of_predictions(self, system: System) -> Plan:
+        """Plan the law of every observation given those before it."""
+        return self._plan(system, PREDICTIONS_OF_CHAIN, functions=("observe",))
 
     def smoothing_method(self, system: System) -> str:
         """Name the method of the smoothed states."""

@@ -20,7 +20,6 @@ import numpy as np
 from ..compiler.native.entry_point import EntryPoint
 from ..compiler.native.jit import njit_internal
 from ..compiler.native.plan import Plan
-from ..compiler.native.planned_function import PlannedFunction
 from ..errors import ModelError
 from .calls import OK, likelihood_entry, state_given
 from .plan import make_plan, read_system, settings_of
@@ -31,7 +30,6 @@ from .point_mass.predictions import GRID_PREDICTIONS
 from .point_mass.segment_pass import along_record, finished
 from .point_mass.states import GRID_STATES
 from .protocol import System, check_sensor_has_noise
-from .signatures import LIKELIHOOD, PREDICTIONS, RUN, STATES
 from .state_law import StateLaw
 
 # Beside a kink the error falls with the square of the spacing: 8192 points reach about 1e-6.
@@ -151,25 +149,24 @@ class GridFilter:
         """Return this filter with the largest tolerance that still tells where a posterior lies."""
         return GridFilter(tolerance=max(self.tolerance, _COARSE))
 
-    def compile(self, system: System) -> PlannedFunction:
-        """Compile the log-likelihood."""
-        return PlannedFunction(self._plan(system, POINT_MASS), *LIKELIHOOD)
+    def plan_of_likelihood(self, system: System) -> Plan:
+        """Plan the log-likelihood."""
+        return self._plan(system, POINT_MASS)
 
-    def compile_states(self, system: System, moment: str) -> PlannedFunction:
-        """Compile "predicted", "filtered" or "smoothed" states.
+    def plan_of_states(self, system: System, moment: str) -> Plan:
+        """Plan "predicted", "filtered" or "smoothed" states.
 
         The draws of one ``draw_seed`` are independent; if smoothed, they are a path.
         """
-        return PlannedFunction(self._plan(system, GRID_STATES, MOMENTS[moment]), *STATES)
+        return self._plan(system, GRID_STATES, MOMENTS[moment])
 
-    def compile_predictions(self, system: System) -> PlannedFunction:
-        """Compile the law of every observation given those before it."""
-        plan = self._plan(system, GRID_PREDICTIONS, others=("observe",))
-        return PlannedFunction(plan, *PREDICTIONS)
+    def plan_of_predictions(self, system: System) -> Plan:
+        """Plan the law of every observation given those before it."""
+        return self._plan(system, GRID_PREDICTIONS, others=("observe",))
 
-    def compile_run(self, system: System) -> PlannedFunction:
-        """Compile one run with all that it computes."""
-        return PlannedFunction(self._plan(system, GRID_STATES, FILTERED), *RUN)
+    def plan_of_run(self, system: System) -> Plan:
+        """Plan one run with all that it computes."""
+        return self._plan(system, GRID_STATES, FILTERED)
 
     def _plan(
         self, system: System, run: EntryPoint, *settings: int, others: Sequence[str] = ()

@@ -5,7 +5,7 @@ from dataclasses import KW_ONLY, dataclass, field
 import numpy as np
 
 from ..compiler.lowering.compiled_system import compile_system
-from ..compiler.native.planned_function import PlannedFunction
+from ..compiler.native.plan import Plan
 from .ekf import EKF
 from .gaussian.base import GaussianFilterBase
 from .gaussian.functions import GaussianFilterFunctions
@@ -15,7 +15,6 @@ from .regimes.checks import check_hybrid, check_inner
 from .regimes.hybrid import hybrid_of
 from .regimes.mixture import mixture_functions
 from .regimes.mixture_states import states_plan
-from .signatures import STATES
 from .state_law import StateLaw, law_of_regimes
 from .ukf import UKF
 
@@ -100,11 +99,10 @@ class IMM(GaussianFilterBase):
         """Whether nothing has a kink or jump in states or parameters, given the regimes."""
         return hybrid_of(system.written).is_smooth
 
-    def compile_states(self, system: System, moment: str) -> PlannedFunction:
-        """Compile "predicted", "filtered" or "smoothed" states."""
+    def plan_of_states(self, system: System, moment: str) -> Plan:
+        """Plan "predicted", "filtered" or "smoothed" states."""
         hybrid, by = hybrid_of(system.model), self.inner.linearization
-        plan = states_plan(system, hybrid, by, self._functions(system), moment)
-        return PlannedFunction(plan, *STATES)
+        return states_plan(system, hybrid, by, self._functions(system), moment)
 
     def law_of_state(self, system: System, states: np.ndarray) -> StateLaw:
         """Return the law of the state, from what the filter leaves (m, S) at m points."""

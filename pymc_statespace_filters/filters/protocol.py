@@ -3,10 +3,9 @@
 A filter is an immutable, hashable object that holds settings. It states which systems it supports
 and plans functions for one system, which it is given as a `System`. A filter of a user's own is
 three functions and a subclass of `ensemble.parts.PartsFilter`. What only some filters can are the
-methods of `BatchFilter`, `DifferentiableFilter`, `EnsembleFilter`, `PredictionFilter` and
-`ToleranceFilter`.
+methods of `DifferentiableFilter`, `EnsembleFilter`, `PredictionFilter` and `ToleranceFilter`.
 
-Arguments and results of the functions are those of `filters.signatures`. Their arrays:
+Arguments and results of the functions are those of `ops.signatures`. Their arrays:
 ``theta`` (k,) parameters; ``steps`` (J,) int64, the step of each observation; ``observed`` (J, p),
 NaN where missing; ``inputs`` (rows, n_inputs), row k holds during step k; ``t0`` the time of step
 0. They return ``terms`` (J,), log p(d_j | d_1 .. d_{j-1}), 0 for a row that is wholly missing and
@@ -21,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..compiler.native.plan import Plan
-from ..compiler.native.planned_function import PlannedFunction
 from ..errors import ModelError
 from .state_law import StateLaw
 
@@ -50,14 +48,14 @@ class Filter(Protocol):
     def is_exact_for(self, system: System) -> bool:
         """Whether the likelihood, or the mean of its estimates, is that of the system."""
 
-    def compile(self, system: System) -> PlannedFunction:
-        """Compile the log-likelihood."""
+    def plan_of_likelihood(self, system: System) -> Plan:
+        """Plan the log-likelihood."""
 
-    def compile_run(self, system: System) -> PlannedFunction:
-        """Compile one run with all that it computes."""
+    def plan_of_run(self, system: System) -> Plan:
+        """Plan one run with all that it computes."""
 
-    def compile_states(self, system: System, moment: str) -> PlannedFunction:
-        """Compile "predicted", "filtered" or "smoothed" states."""
+    def plan_of_states(self, system: System, moment: str) -> Plan:
+        """Plan "predicted", "filtered" or "smoothed" states."""
         ...
 
     def smoothing_method(self, system: System) -> str:
@@ -71,13 +69,15 @@ class Filter(Protocol):
 class PredictionFilter(Filter, Protocol):
     """A filter that knows the law of every observation given those before it."""
 
-    def compile_predictions(self, system: System) -> PlannedFunction:
-        """Compile the law of every observation, for systems with additive Gaussian noise."""
+    def plan_of_predictions(self, system: System) -> Plan:
+        """Plan the law of every observation, for systems with additive Gaussian noise."""
 
 
 @runtime_checkable
 class DifferentiableFilter(Filter, Protocol):
-    """A filter whose likelihood has a gradient.
+    """A filter whose likelihood has a gradient, and that takes many records or points in one pass.
+
+    Every record and point has the terms that it has alone, see `ops.signatures`.
 
     A gradient is a forward pass, which leaves a tape, and a backward pass over it. A graph that
     holds the likelihood too shares the forward pass. The tape has a row before each prediction and
@@ -86,25 +86,13 @@ class DifferentiableFilter(Filter, Protocol):
     deterministic system the mean is enough. A filter with another tape is a `PredictionFilter`.
     """
 
-    def compile_gradient(self, system: System) -> PlannedFunction:
-        """Compile both passes as one function."""
-
-    def compile_taped(self, system: System) -> PlannedFunction:
-        """Compile the forward pass: terms, health and the tape."""
-
-    def compile_pullback(self, system: System) -> PlannedFunction:
-        """Compile the backward pass: (theta .. seed, tape, terms_bar) -> theta_bar."""
-
-
-@runtime_checkable
-class BatchFilter(DifferentiableFilter, Protocol):
-    """A filter that evaluates many parameter points, or the records of a panel, side by side.
-
-    Every point and record has the terms that it has alone, see `filters.signatures`.
-    """
-
-    def plan_of_many(
-        self, system: System, *, leaves_tape: bool = False, goes_back: bool = False
+    def plan_of_pass(
+        self,
+        system: System,
+        *,
+        of_many: bool = False,
+        leaves_tape: bool = False,
+        goes_back: bool = False,
     ) -> Plan:
         """Plan the forward pass, with a tape or without one, or the pass back along a tape.
 
@@ -128,11 +116,8 @@ class EnsembleFilter(Filter, Protocol):
     def n_normals(self, system: System, n_steps: Any, n_observations: Any) -> Any:
         """Return how many normals one evaluation uses."""
 
-    def stored_noise(self, system: System) -> PlannedFunction:
-        """Compile the making of these normals: (steps, seed) -> one vector."""
-
-    def compile_health(self, system: System) -> PlannedFunction:
-        """Compile the effective number of members behind every term."""
+    def plan_of_noise(self, system: System) -> Plan:
+        """Plan the making of these normals: (steps, seed) -> one vector."""
 
 
 @runtime_checkable
@@ -146,10 +131,10 @@ class ToleranceFilter(Filter, Protocol):
 class Properties(NamedTuple):
     """What a filter is beyond its methods: its attributes of these names, False if it has none.
 
-    It ``resumes_many`` if its `BatchFilter.plan_of_many` goes on at many points; its particles
-    move by the rows to come if it ``needs_record_ahead``; and the mean of its estimates is the
-    likelihood, for any number of members, if it is ``unbiased``. One that ``finds_path`` compiles
-    "most probable" states, too.
+    It ``resumes_many`` if its passes of many points go on from states; its particles move by the
+    rows to come if it ``needs_record_ahead``; and the mean of its estimates is the likelihood, for
+    any number of members, if it is ``unbiased``. One that ``finds_path`` plans "most probable"
+    states, too.
     """
 
     resumes_many: bool

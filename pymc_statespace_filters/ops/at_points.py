@@ -7,10 +7,10 @@ import numpy as np
 from ..compiler.native.compilation import COMPILATION
 from ..compiler.native.planned_rows import PlannedRow
 from ..compiler.native.rows import Rows
-from ..filters.signatures import POINTS
 from ..parallel.shared_rows import evaluated_rows
 from ..parallel.threads import Pieces
 from .base import FilterOp, evaluator, kernel
+from .signatures import POINTS
 
 _PIECE_SECONDS = 0.02  # of one call for many points, for whose end an interrupt waits
 _AT_ONCE = 8  # points, at least, of one such call

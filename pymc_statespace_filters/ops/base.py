@@ -22,9 +22,9 @@ from ..compiler.native.plan import ARGUMENTS, Plan
 from ..compiler.native.planned_function import PlannedFunction
 from ..compiler.native.python_call import TimedCall, call_machine_code
 from ..filters.protocol import Filter
-from ..filters.signatures import ONE_RECORD, Form, Signature
 from ..system.model import StateSpaceModel
 from ..system.panel_records import STEP
+from .signatures import ONE_RECORD, Form, Signature
 
 HEALTH_SIZE = 3
 _READY = 0x0001 | 0x0100 | 0x0400  # flags of NumPy: contiguous in C's order, aligned, writeable
@@ -64,8 +64,8 @@ class FilterOp(Op):
         """The same operation of another system or filter."""
         return type(self)(system, filter, self.form)
 
-    def compile(self, system: CompiledSystem) -> PlannedFunction | Plan:
-        """Compile or plan the function of the inputs."""
+    def plan(self, system: CompiledSystem) -> Plan:
+        """Plan the function of the inputs."""
         raise NotImplementedError
 
     def symbol(self, name: str) -> Variable:
@@ -155,8 +155,7 @@ def _ready(value: Any, kind: np.dtype) -> np.ndarray:
 @cache
 def kernel(op: FilterOp) -> PlannedFunction:
     """The compiled function of an operation, made once."""
-    compiled = op.compile(compile_system(op.system))
-    plan = compiled if isinstance(compiled, Plan) else compiled.plan
+    plan = op.plan(compile_system(op.system))
     return PlannedFunction(plan, op.arguments, op.results)
 
 

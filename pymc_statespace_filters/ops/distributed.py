@@ -25,12 +25,12 @@ from ..compiler.native.plan import (
 )
 from ..errors import ModelError
 from ..filters.protocol import EnsembleFilter, Filter
-from ..filters.signatures import LIKELIHOOD, SEEDED, Signature
 from ..filters.written import short_form
 from ..parallel.communicator import Communicator
 from ..system.model import StateSpaceModel
 from .base import evaluator
 from .likelihood import LogLikelihood
+from .signatures import LIKELIHOOD, SEEDED, Signature
 
 Evaluate = Callable[..., tuple[np.ndarray, np.ndarray]]
 

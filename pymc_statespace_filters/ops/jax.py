@@ -18,7 +18,6 @@ from jax.experimental.buffer_callback import buffer_callback
 from pytensor.link.jax.dispatch import jax_funcify
 
 from ..errors import GradientUnavailableError, ModelError
-from ..filters.signatures import POINTS
 from .base import HEALTH_SIZE
 from .likelihood import (
     LogLikelihood,
@@ -28,6 +27,7 @@ from .likelihood import (
     check_has_gradient,
 )
 from .many_points import gradients, values
+from .signatures import POINTS
 
 type Shapes = Sequence[tuple[int, ...]]
 

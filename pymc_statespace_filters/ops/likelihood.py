@@ -5,7 +5,7 @@ inputs, a rewrite replaces them by one forward pass that leaves a tape, `TapedLo
 one backward pass over it, `TapePullback`.
 
 A record of a panel is evaluated by the machine code of a single one, so that it has the same bits,
-unless the filter evaluates records side by side (`filters.protocol.BatchFilter`).
+unless the filter evaluates records side by side (`filters.protocol.DifferentiableFilter`).
 """
 
 from collections.abc import Sequence
@@ -22,11 +22,12 @@ from pytensor.tensor.rewriting.basic import register_specialize
 
 from ..compiler.lowering.compiled_system import CompiledSystem, compile_system
 from ..compiler.native.plan import Plan
-from ..compiler.native.planned_function import PlannedFunction
 from ..errors import GradientUnavailableError
 from ..facts import Fact, in_words
-from ..filters.protocol import BatchFilter, DifferentiableFilter, EnsembleFilter
-from ..filters.signatures import (
+from ..filters.protocol import DifferentiableFilter, EnsembleFilter
+from ..filters.written import short_form
+from .base import HEALTH_SIZE, FilterOp, theta_cotangent_only
+from .signatures import (
     GRADIENT,
     LIKELIHOOD,
     NORMALS,
@@ -38,8 +39,6 @@ from ..filters.signatures import (
     TAPED,
     Signature,
 )
-from ..filters.written import short_form
-from .base import HEALTH_SIZE, FilterOp, theta_cotangent_only
 
 
 class LogLikelihood(FilterOp):
@@ -47,17 +46,17 @@ class LogLikelihood(FilterOp):
 
     Inputs: ``theta`` (k,), ``steps`` (J,), ``observed`` (J, p), ``inputs`` (steps, n_inputs),
     ``t0``, ``seed``. Outputs: terms (J,), and health (3,): smallest effective number of
-    particles, code of the failure, index of the failing observation. See `filters.signatures` for
+    particles, code of the failure, index of the failing observation. See `ops.signatures` for
     those of many points and of a panel.
     """
 
     signature = LIKELIHOOD
 
-    def compile(self, system: CompiledSystem) -> PlannedFunction | Plan:
+    def plan(self, system: CompiledSystem) -> Plan:
         """The filter's log-likelihood."""
-        if self.form != ONE_RECORD and isinstance(self.filter, BatchFilter):
-            return self.filter.plan_of_many(system)
-        return self.filter.compile(system)
+        if self.form != ONE_RECORD and isinstance(self.filter, DifferentiableFilter):
+            return self.filter.plan_of_pass(system, of_many=True)
+        return self.filter.plan_of_likelihood(system)
 
     def infer_shape(self, node: Apply, input_shapes: Sequence) -> list[tuple]:
         """As many terms as steps, for every point."""
@@ -114,11 +113,10 @@ class LogLikelihoodGradient(FilterOp):
     signature = GRADIENT
     filter: DifferentiableFilter
 
-    def compile(self, system: CompiledSystem) -> PlannedFunction | Plan:
+    def plan(self, system: CompiledSystem) -> Plan:
         """Both passes of the filter."""
-        if self.form == PANEL and isinstance(self.filter, BatchFilter):
-            return self.filter.plan_of_many(system, leaves_tape=True, goes_back=True)
-        return self.filter.compile_gradient(system)
+        many = self.form == PANEL
+        return self.filter.plan_of_pass(system, of_many=many, leaves_tape=True, goes_back=True)
 
     def infer_shape(self, node: Apply, input_shapes: Sequence) -> list[tuple]:
         """The shape of theta."""
@@ -131,11 +129,9 @@ class TapedLogLikelihood(FilterOp):
     signature = TAPED
     filter: DifferentiableFilter
 
-    def compile(self, system: CompiledSystem) -> PlannedFunction | Plan:
+    def plan(self, system: CompiledSystem) -> Plan:
         """The forward pass."""
-        if self.form == PANEL and isinstance(self.filter, BatchFilter):
-            return self.filter.plan_of_many(system, leaves_tape=True)
-        return self.filter.compile_taped(system)
+        return self.filter.plan_of_pass(system, of_many=self.form == PANEL, leaves_tape=True)
 
 
 class TapePullback(FilterOp):
@@ -145,11 +141,9 @@ class TapePullback(FilterOp):
     filter: DifferentiableFilter
     infer_shape = LogLikelihoodGradient.infer_shape
 
-    def compile(self, system: CompiledSystem) -> PlannedFunction | Plan:
+    def plan(self, system: CompiledSystem) -> Plan:
         """The backward pass."""
-        if self.form == PANEL and isinstance(self.filter, BatchFilter):
-            return self.filter.plan_of_many(system, goes_back=True)
-        return self.filter.compile_pullback(system)
+        return self.filter.plan_of_pass(system, of_many=self.form == PANEL, goes_back=True)
 
 
 @register_specialize
@@ -157,8 +151,6 @@ class TapePullback(FilterOp):
 def fuse_value_and_gradient(fgraph: FunctionGraph, node: Apply) -> dict[Variable, Variable] | None:
     """Make one forward pass where a graph holds value and gradient at the same inputs."""
     op = node.op
-    if op.form == PANEL and not isinstance(op.filter, BatchFilter):
-        return None
     *inputs, terms_bar = node.inputs
     value_op, taped, pullback = (
         kind(op.system, op.filter, op.form)
@@ -183,7 +175,7 @@ def vectorized(op: LogLikelihood, *inputs: Variable) -> list[Variable]:
         for value, n in zip(record, extra[1:], strict=True)
         for length in value.type.shape[:n]
     )
-    is_batch = op.form == ONE_RECORD and isinstance(op.filter, BatchFilter)
+    is_batch = op.form == ONE_RECORD and isinstance(op.filter, DifferentiableFilter)
     if not (is_batch and one_record and extra[0]):
         return Blockwise(op)(*inputs, return_list=True)
     record = [value[(0,) * n] if n else value for value, n in zip(record, extra[1:], strict=True)]
@@ -211,9 +203,9 @@ class StoredNoise(FilterOp):
     signature = NORMALS
     filter: EnsembleFilter
 
-    def compile(self, system: CompiledSystem) -> PlannedFunction | Plan:
+    def plan(self, system: CompiledSystem) -> Plan:
         """The normals, in the filter's layout."""
-        return self.filter.stored_noise(system)
+        return self.filter.plan_of_noise(system)
 
 
 class LogLikelihoodOfNoise(LogLikelihood):

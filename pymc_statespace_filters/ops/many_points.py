@@ -10,11 +10,11 @@ from math import prod
 
 import numpy as np
 
-from ..filters.protocol import BatchFilter
-from ..filters.signatures import ONE_RECORD, PANEL, POINTS
+from ..filters.protocol import DifferentiableFilter
 from ..system.panel_records import rows_of_copies
 from .base import FilterOp, evaluator
 from .likelihood import LogLikelihood, LogLikelihoodGradient, TapedLogLikelihood, TapePullback
+from .signatures import ONE_RECORD, PANEL, POINTS
 
 type Arrays = Sequence[np.ndarray]
 type Shape = tuple[int, ...]
@@ -25,7 +25,7 @@ def values(op: LogLikelihood, *arguments: np.ndarray) -> list[np.ndarray]:
     shape, cores = _shapes(op, arguments)
     is_one_record = prod(shape) > 1 and type(op) is LogLikelihood
     record = _shared(arguments[1:], cores[1:]) if is_one_record else []
-    if not (record and isinstance(op.filter, BatchFilter)):
+    if not (record and isinstance(op.filter, DifferentiableFilter)):
         return _in_turn(op, arguments, shape, cores)
     thetas = arguments[0].reshape(-1, *cores[0])
     if op.form == ONE_RECORD:
@@ -43,13 +43,12 @@ def values(op: LogLikelihood, *arguments: np.ndarray) -> list[np.ndarray]:
 def gradients(op: LogLikelihoodGradient, *arguments: np.ndarray) -> list[np.ndarray]:
     """The cotangent of theta (.., k) or (.., G, k); the last argument is that of the terms."""
     shape, cores = _shapes(op, arguments)
-    if prod(shape) > 1 and isinstance(op.filter, BatchFilter):
-        if record := _shared(arguments[1:-1], cores[1:-1]):
-            thetas, terms_bar = (
-                np.broadcast_to(arguments[i], shape + cores[i]).reshape(-1, *cores[i])
-                for i in (0, -1)
-            )
-            return [_side_by_side(op, thetas, record, terms_bar).reshape(shape + cores[0])]
+    record = _shared(arguments[1:-1], cores[1:-1]) if prod(shape) > 1 else []
+    if record:
+        thetas, terms_bar = (
+            np.broadcast_to(arguments[i], shape + cores[i]).reshape(-1, *cores[i]) for i in (0, -1)
+        )
+        return [_side_by_side(op, thetas, record, terms_bar).reshape(shape + cores[0])]
     return _in_turn(op, arguments, shape, cores)
 
 

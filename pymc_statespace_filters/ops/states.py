@@ -6,11 +6,10 @@ import numpy as np
 
 from ..compiler.lowering.compiled_system import CompiledSystem
 from ..compiler.native.plan import Plan
-from ..compiler.native.planned_function import PlannedFunction
-from ..filters.protocol import BatchFilter, EnsembleFilter, Filter, PredictionFilter
-from ..filters.signatures import GOING_ON, POINTS, PREDICTIONS, RUN, STATES, TERM_HEALTH
+from ..filters.protocol import DifferentiableFilter, EnsembleFilter, Filter, PredictionFilter
 from ..system.model import StateSpaceModel
 from .base import FilterOp
+from .signatures import GOING_ON, POINTS, PREDICTIONS, RUN, STATES, TERM_HEALTH
 
 
 class States(FilterOp):
@@ -27,9 +26,9 @@ class States(FilterOp):
         super().__init__(system, filter)
         self.moment = moment
 
-    def compile(self, system: CompiledSystem) -> PlannedFunction | Plan:
+    def plan(self, system: CompiledSystem) -> Plan:
         """The filter's states."""
-        return self.filter.compile_states(system, self.moment)
+        return self.filter.plan_of_states(system, self.moment)
 
 
 class FilterRun(FilterOp):
@@ -40,9 +39,9 @@ class FilterRun(FilterOp):
 
     signature = RUN
 
-    def compile(self, system: CompiledSystem) -> PlannedFunction | Plan:
+    def plan(self, system: CompiledSystem) -> Plan:
         """The filter's run."""
-        return self.filter.compile_run(system)
+        return self.filter.plan_of_run(system)
 
 
 class GoingOn(FilterOp):
@@ -52,14 +51,14 @@ class GoingOn(FilterOp):
     """
 
     signature = GOING_ON
-    filter: BatchFilter
+    filter: DifferentiableFilter
 
-    def __init__(self, system: StateSpaceModel, filter: BatchFilter) -> None:
+    def __init__(self, system: StateSpaceModel, filter: DifferentiableFilter) -> None:
         super().__init__(system, filter, POINTS)
 
-    def compile(self, system: CompiledSystem) -> PlannedFunction | Plan:
+    def plan(self, system: CompiledSystem) -> Plan:
         """The filter at all points, side by side if it can."""
-        return self.filter.plan_of_many(system)
+        return self.filter.plan_of_pass(system, of_many=True)
 
     def n_steps(self, inputs: Sequence[np.ndarray]) -> int:
         """Steps of an evaluation at all points."""
@@ -74,9 +73,9 @@ class TermHealth(FilterOp):
     signature = TERM_HEALTH
     filter: EnsembleFilter
 
-    def compile(self, system: CompiledSystem) -> PlannedFunction | Plan:
+    def plan(self, system: CompiledSystem) -> Plan:
         """The filter's health."""
-        return self.filter.compile_health(system)
+        return self.filter.plan_of_likelihood(system)
 
 
 class Predictions(FilterOp):
@@ -85,6 +84,6 @@ class Predictions(FilterOp):
     signature = PREDICTIONS
     filter: PredictionFilter
 
-    def compile(self, system: CompiledSystem) -> PlannedFunction | Plan:
+    def plan(self, system: CompiledSystem) -> Plan:
         """The filter's predictions."""
-        return self.filter.compile_predictions(system)
+        return self.filter.plan_of_predictions(system)

@@ -23,8 +23,8 @@ from pytensor.tensor.shape import Reshape, Shape, Shape_i, SpecifyShape
 from pytensor.tensor.special import LogSumExp, Softmax
 from pytensor.tensor.subtensor import AdvancedSubtensor, Subtensor
 
-from ..filters.signatures import PANEL
 from ..ops.likelihood import LogLikelihood
+from ..ops.signatures import PANEL
 from ..system.panel_records import RECORD
 
 

@@ -20,8 +20,8 @@ from ..compiler.native.plan import Refusal
 from ..errors import ModelError
 from ..evaluation.simulate import simulator
 from ..filters.calls import status_of_rows
-from ..filters.signatures import ONE_RECORD, PANEL
 from ..ops.likelihood import LogLikelihood, vectorized
+from ..ops.signatures import ONE_RECORD, PANEL
 from ..system.panel_records import FIRST_INPUT, RECORD, STEP
 from .held_seed import warn_of_held_seed
 from .inspection import state_space_nodes

@@ -17,9 +17,9 @@ from pytensor.graph.traversal import ancestors
 from ..filters.checks import check_system_and_filter
 from ..filters.outcomes import Failure
 from ..filters.protocol import Filter
-from ..filters.signatures import ONE_RECORD, PANEL
 from ..ops.at_points import FilterAtPoints
 from ..ops.likelihood import LogLikelihood
+from ..ops.signatures import ONE_RECORD, PANEL
 from .at_points import GraphsAtPoints
 from .density import check_free_variables
 from .inspection import scored_rows, state_space_nodes

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..compiler.lowering.compiled_system import compile_system
-from ..filters.protocol import BatchFilter, Filter, properties
+from ..filters.protocol import DifferentiableFilter, Filter, properties
 from ..filters.state_law import StateLaw
 from ..ops.at_points import FilterAtPoints
 from ..ops.base import FilterOp
@@ -46,7 +46,7 @@ class FilterRows:
         self._together = properties(filter).resumes_many
         operation: FilterOp = FilterRun(system, filter)
         if self._together:
-            assert isinstance(filter, BatchFilter)
+            assert isinstance(filter, DifferentiableFilter)
             operation = GoingOn(system, filter)
         self._at_points = FilterAtPoints(operation, ["terms", "state"])
 

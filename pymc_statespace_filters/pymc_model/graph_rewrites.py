@@ -18,9 +18,9 @@ from ..errors import ModelError
 from ..filters import EKF, IPLF
 from ..filters.checks import check_system_and_filter, takes
 from ..filters.protocol import Filter, ToleranceFilter
-from ..filters.signatures import PANEL
 from ..ops.distributed import CallbackLogLikelihood, CallbackLogLikelihoodOfNoise
 from ..ops.likelihood import LogLikelihood, LogLikelihoodOfNoise, StoredNoise
+from ..ops.signatures import PANEL
 from ..system.model import StateSpaceModel
 from .inspection import likelihood_nodes, noisy_filters, state_space_nodes
 

@@ -14,7 +14,7 @@ from ..compiler.lowering.compiled_system import compile_system
 from ..compiler.lowering.symbols import call, jacobian_of, symbols_of
 from ..compiler.native.rows import interpreted_at_points
 from ..errors import ModelError
-from ..filters.signatures import PANEL
+from ..ops.signatures import PANEL
 from ..system.input_columns import divided, with_resets
 from ..system.integrators.substeps import CoupledNoise
 from ..system.model import StateSpaceModel

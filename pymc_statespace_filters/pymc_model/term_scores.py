@@ -13,10 +13,10 @@ from pytensor.graph.traversal import ancestors
 
 from ..compiler.lowering.structure import parameters_after_start
 from ..errors import ModelError
-from ..filters.signatures import PANEL
 from ..filters.written import short_form
 from ..ops.base import evaluator
 from ..ops.likelihood import LogLikelihood
+from ..ops.signatures import PANEL
 from ..system.panel_records import FIRST_INPUT, RECORD, STEP, records_of, rows_of_copies
 from ..system.parameters import element_names
 from .at_points import GraphsAtPoints

@@ -13,6 +13,8 @@ from pymc_statespace_filters.compiler.codegen.array_fallback import _frontier, a
 from pymc_statespace_filters.compiler.codegen.function_types import Graph
 from pymc_statespace_filters.compiler.codegen.functions import member_function, vector_function
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.ops.base import kernel
+from pymc_statespace_filters.ops.likelihood import LogLikelihood
 
 
 def vector(name, size):
@@ -161,9 +163,8 @@ def test_what_has_no_machine_code_is_named():
 
 def test_keys_tell_settings_apart():
     keys = {
-        psf.EnKF(10)
-        .compile(
-            compile_system(
+        kernel(
+            LogLikelihood(
                 psf.StateSpaceModel(
                     transition=lambda x, a: [a * x[0]],
                     observation=lambda x: [x[0]],
@@ -171,10 +172,10 @@ def test_keys_tell_settings_apart():
                     initial_mean=[0.0],
                     initial_cov=[[1.0]],
                     dt=dt,
-                )
+                ),
+                psf.EnKF(10),
             )
-        )
-        .key
+        ).key
         for noise in (1.0, 2.0)
         for dt in (0.1, 0.2)
     }

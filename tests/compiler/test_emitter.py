@@ -25,6 +25,8 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.codegen.machine_code import Module, ModuleEntryPoint
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
+from pymc_statespace_filters.ops.base import kernel
+from pymc_statespace_filters.ops.likelihood import LogLikelihood, LogLikelihoodGradient
 
 EntryPoint.compile = lambda entry: None  # the text is asked for, not the code
 ModuleEntryPoint.compile = lambda entry: None
@@ -58,8 +60,8 @@ for system in (gaussian, counted):
     print(system.fingerprint)
     machine = compile_system(system)
     print(machine.propagate.key, machine.log_density.key)
-print(psf.EKF().compile_gradient(compile_system(gaussian)).key)
-print(psf.EnKF(100).compile(compile_system(gaussian)).key)
+print(kernel(LogLikelihoodGradient(gaussian, psf.EKF())).key)
+print(kernel(LogLikelihood(gaussian, psf.EnKF(100))).key)
 print(*sources, sep="\\n")
 """
 

@@ -11,9 +11,9 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.codegen import functions as lowering
-from pymc_statespace_filters.filters.signatures import POINTS
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood, LogLikelihoodGradient
+from pymc_statespace_filters.ops.signatures import POINTS
 from pymc_statespace_filters.testing import kalman_log_likelihood
 
 N_STATES = 12

@@ -123,7 +123,7 @@ def test_twenty_coupled_states_are_written_out(caplog, monkeypatch):
     """On arrays, their EKF takes 50 CPU seconds to compile and runs seventeen times slower."""
     monkeypatch.setattr(lowering, "array_vector_function", None)
     with caplog.at_level(logging.DEBUG, "pymc_statespace_filters"):
-        psf.EKF().compile(compile_system(ring(20)))
+        psf.EKF().plan_of_likelihood(compile_system(ring(20)))
     for part in ("start", "predict", "update"):
         assert f"{part}: written out in scalars" in caplog.messages
 

@@ -1,6 +1,6 @@
 """Systems without noise whose start is known: an exact likelihood by one run of the equations."""
 
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pymc as pm
@@ -16,9 +16,15 @@ from pymc_statespace_filters.compiler.lowering.compiled_system import compile_sy
 from pymc_statespace_filters.errors import FilterWarning
 from pymc_statespace_filters.filters.checks import check_choice
 from pymc_statespace_filters.filters.outcomes import STATE_NOT_FINITE
-from pymc_statespace_filters.filters.signatures import POINTS
-from pymc_statespace_filters.ops.base import evaluator
-from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.ops.base import evaluator, kernel
+from pymc_statespace_filters.ops.likelihood import (
+    LogLikelihood,
+    LogLikelihoodGradient,
+    TapedLogLikelihood,
+    TapePullback,
+)
+from pymc_statespace_filters.ops.signatures import POINTS
+from pymc_statespace_filters.ops.states import FilterRun, States
 
 STEPS = np.array([0, 3, 4, 9])
 OBSERVED = np.array([[0.5, -0.2], [np.nan, 0.4], [np.nan, np.nan], [0.1, 0.3]])
@@ -57,8 +63,8 @@ def theta_of(**changes):
 
 
 @cache
-def compiled(method, system, *arguments):
-    return getattr(psf.EKF(), method)(compile_system(system), *arguments).function
+def compiled(kind, system, *arguments):
+    return evaluator(kind(system, psf.EKF(), *arguments))
 
 
 def path(theta):
@@ -128,14 +134,13 @@ def test_a_guide_can_be_written_out_without_process_noise():
 
 
 def test_the_gaussian_filters_are_one():
-    system = compile_system(KNOWN)
-    for method in ("compile", "compile_pullback", "plan_of_many", "compile_run"):
-        first, *others = (getattr(f, method)(system).key for f in GAUSSIAN)
+    for kind in (LogLikelihood, TapePullback, FilterRun, partial(LogLikelihood, form=POINTS)):
+        first, *others = (kernel(kind(KNOWN, filter)).key for filter in GAUSSIAN)
         assert others == [first, first]
 
 
 def test_the_value_is_that_of_the_equations_and_only_the_state_is_carried():
-    terms, health, tape = compiled("compile_taped", KNOWN)(theta_of(), *RECORD)
+    terms, health, tape = compiled(TapedLogLikelihood, KNOWN)(theta_of(), *RECORD)
     np.testing.assert_allclose(terms, terms_of(theta_of()), rtol=1e-12)
     np.testing.assert_array_equal(health, [np.inf, 0.0, -1.0])
     assert tape.shape == (STEPS[-1] + len(STEPS), 2)
@@ -143,8 +148,8 @@ def test_the_value_is_that_of_the_equations_and_only_the_state_is_carried():
 
 def test_the_gradient_is_that_of_the_equations():
     bars = np.array([1.0, -2.0, 0.5, 3.0])
-    _, _, tape = compiled("compile_taped", KNOWN)(theta_of(), *RECORD)
-    found = compiled("compile_pullback", KNOWN)(theta_of(), *RECORD, tape, bars)
+    _, _, tape = compiled(TapedLogLikelihood, KNOWN)(theta_of(), *RECORD)
+    (found,) = compiled(TapePullback, KNOWN)(theta_of(), *RECORD, tape, bars)
     points = theta_of() + 1e-30j * np.eye(4)
     truth = [(terms_of(point) @ bars).imag / 1e-30 for point in points]
     np.testing.assert_allclose(found, truth, rtol=1e-11)
@@ -158,20 +163,20 @@ def test_many_points_side_by_side():
 
 
 def test_states_are_the_path_without_spread():
-    found = psf.EKF().compile_states(compile_system(KNOWN), "smoothed")
-    mean, sd, drawn, n_effective, health = found.function(theta_of(), *RECORD, ROWS, 3)
+    found = States(KNOWN, psf.EKF(), "smoothed")
+    mean, sd, drawn, n_effective, health = evaluator(found)(theta_of(), *RECORD, ROWS, 3)
     np.testing.assert_allclose(mean, path(theta_of()), rtol=1e-12)
     np.testing.assert_array_equal(drawn, mean)
     np.testing.assert_array_equal(sd, 0.0)
     assert (n_effective == np.inf).all()
     np.testing.assert_array_equal(health, [np.inf, 0.0, -1.0])
     for moment in ("predicted", "filtered"):
-        assert psf.EKF().compile_states(compile_system(KNOWN), moment).key == found.key
+        assert kernel(States(KNOWN, psf.EKF(), moment)).key == kernel(found).key
 
 
 def test_a_run_is_the_path_without_covariance():
     rows = ROWS[::2]
-    run = compiled("compile_run", KNOWN)(theta_of(), *RECORD, rows, np.empty(0))
+    run = compiled(FilterRun, KNOWN)(theta_of(), *RECORD, rows, np.empty(0))
     terms, _, mean, cov, members, *_ = run
     np.testing.assert_allclose(terms, terms_of(theta_of()), rtol=1e-12)
     np.testing.assert_allclose(mean, path(theta_of())[rows], rtol=1e-12)
@@ -181,7 +186,7 @@ def test_a_run_is_the_path_without_covariance():
 
 def test_a_path_that_explodes_fails_from_there_on():
     theta = theta_of(stiffness=-1e200)
-    run = compiled("compile_run", KNOWN)(theta, *RECORD, ROWS, np.empty(0))
+    run = compiled(FilterRun, KNOWN)(theta, *RECORD, ROWS, np.empty(0))
     terms, health, mean, cov, *_ = run
     assert np.isfinite(terms[0])
     assert (terms[1:] == -np.inf).all()
@@ -239,7 +244,7 @@ def test_the_gradient_is_that_of_the_closed_form():
     truth["s"] = np.sum(z**2 - 1.0) / s
     theta = np.array([{"k": k, "x0": x0, "s": s}[name] for name in system.parameters])
     steps = np.round(TIMES / 0.01).astype(np.int64)
-    found = compiled("compile_gradient", system)(
+    (found,) = compiled(LogLikelihoodGradient, system)(
         theta, steps, DECAY[:, None], np.zeros((251, 0)), 0.0, 0, np.ones(4)
     )
     np.testing.assert_allclose(found, [truth[name] for name in system.parameters], atol=1e-8)
@@ -298,7 +303,7 @@ COUNTS = np.array([[4.0, 2.0], [1.0, 3.0], [np.nan, np.nan], [0.0, 1.0]])
 
 
 def test_counts_have_their_own_density_and_its_gradient():
-    value = compiled("compile", COUNTED)
+    value = compiled(LogLikelihood, COUNTED)
     record = (10 * np.arange(4), COUNTS, np.zeros((31, 0)), 0.0, 0)
     theta = np.array([2.0, 3.0])  # k, x0
 
@@ -309,8 +314,8 @@ def test_counts_have_their_own_density_and_its_gradient():
     truth = stats.poisson.logpmf(COUNTS[:, 0], mean)
     truth += stats.nbinom.logpmf(COUNTS[:, 1], 2.0, 2.0 / (2.0 + mean))
     np.testing.assert_allclose(total(*theta), np.nan_to_num(truth), atol=1e-8)
-    _, _, tape = compiled("compile_taped", COUNTED)(theta, *record)
-    slope = compiled("compile_pullback", COUNTED)(theta, *record, tape, np.ones(4))
+    _, _, tape = compiled(TapedLogLikelihood, COUNTED)(theta, *record)
+    (slope,) = compiled(TapePullback, COUNTED)(theta, *record, tape, np.ones(4))
     h = 1e-5
     by_difference = [
         (total(2.0 + h, 3.0) - total(2.0 - h, 3.0)).sum() / (2 * h),

@@ -12,8 +12,9 @@ import pytest
 from scipy import stats
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.filters.outcomes import Failure
+from pymc_statespace_filters.ops.base import evaluator
+from pymc_statespace_filters.ops.states import States as StatesOp
 from tests.references.linear_states import linear_states
 
 DT, T0 = 0.2, 1.5
@@ -72,7 +73,7 @@ class States(NamedTuple):
 def states():
     """The function (moment, params, ...) -> States."""
     functions = {
-        moment: psf.EKF().compile_states(compile_system(SYSTEM), moment).function
+        moment: evaluator(StatesOp(SYSTEM, psf.EKF(), moment))
         for moment in ("predicted", "filtered", "smoothed")
     }
 
@@ -283,7 +284,7 @@ def test_twenty_states_run_on_arrays(moment):
     steps, rows = np.array([0, 2, 5]), np.arange(6)
     observed = np.random.default_rng(20).normal(size=(3, 5))
     observed[1, 1] = np.nan
-    run = psf.EKF().compile_states(compile_system(ring), moment).function
+    run = evaluator(StatesOp(ring, psf.EKF(), moment))
     record = (np.zeros(0), steps, observed, np.zeros((0, 0)), 0.0, 0, rows)
     found, law = States(*run(*record, 0)), (A, B @ B.T, C, 0.2 * np.eye(5), np.ones(n), start)
     truth = linear_states(*law, steps=steps, observed=observed, rows=rows, moment=moment)

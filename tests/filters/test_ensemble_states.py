@@ -19,8 +19,9 @@ from pymc_statespace_filters.filters.ensemble.backward_simulation import (
     _choose_particles,
     _fill_intervals,
 )
-from pymc_statespace_filters.ops.base import evaluator
+from pymc_statespace_filters.ops.base import evaluator, kernel
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.ops.states import States as StatesOp
 from pymc_statespace_filters.system.parameters import flat_parameters
 from tests.compiled import from_python
 from tests.filters.test_ekf_states import States, assert_drawn_from
@@ -60,7 +61,7 @@ LONG_DATA = np.cos(0.3 * LONG_STEPS)[:, None] + 0.4 * np.sin(1.7 * LONG_STEPS)[:
 @cache
 def compiled_states(filter, system, moment):
     """What the filter compiles, without PyTensor's layers around it."""
-    return filter.compile_states(compile_system(system), moment)
+    return kernel(StatesOp(system, filter, moment))
 
 
 def states(

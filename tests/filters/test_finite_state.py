@@ -17,9 +17,9 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.filters.catalog import exact_filter
 from pymc_statespace_filters.filters.markov_chain.backward import _add
 from pymc_statespace_filters.filters.outcomes import Failure
-from pymc_statespace_filters.filters.signatures import PANEL
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.ops.signatures import PANEL
 from pymc_statespace_filters.ops.states import Predictions, States
 from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.parameters import flat_parameters

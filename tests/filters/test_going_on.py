@@ -5,9 +5,9 @@ import pytest
 
 import pymc_statespace_filters as psf
 from benchmarks.corpus import CASES
-from pymc_statespace_filters.filters.signatures import LIKELIHOOD, SEEDED, Signature
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.ops.signatures import LIKELIHOOD, SEEDED, Signature
 from pymc_statespace_filters.pymc_model.filter_rows import FilterRows, Record
 from tests.ranks import on_ranks
 

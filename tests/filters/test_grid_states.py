@@ -11,6 +11,9 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.filters.outcomes import NONE, TOO_FAR
 from pymc_statespace_filters.filters.point_mass.moments import draw
+from pymc_statespace_filters.ops.base import evaluator, kernel
+from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.ops.states import States as StatesOp
 from pymc_statespace_filters.system.parameters import flat_parameters
 from tests.filters.test_ekf_states import States
 from tests.filters.test_grid import linear
@@ -34,7 +37,7 @@ MOMENTS = ("predicted", "filtered", "smoothed")
 
 @cache
 def compiled(system, moment):
-    return psf.GridFilter().compile_states(compile_system(system), moment)
+    return evaluator(StatesOp(system, psf.GridFilter(), moment))
 
 
 def states(system, parameters, steps, observed, rows, moment, *, draw_seed=0, inputs=None):
@@ -325,7 +328,7 @@ def test_no_rows():
 
 def test_what_identifies_the_code_and_the_words_for_it():
     filter = psf.GridFilter()
-    keys = {filter.compile_states(compile_system(FORCED), moment).key for moment in MOMENTS}
-    assert len(keys | {filter.compile(compile_system(FORCED)).key}) == 4
+    keys = {kernel(StatesOp(FORCED, filter, moment)).key for moment in MOMENTS}
+    assert len(keys | {kernel(LogLikelihood(FORCED, filter)).key}) == 4
     assert None not in keys
     assert filter.smoothing_method(compile_system(FORCED)) == "point masses, forward and backward"

@@ -10,9 +10,10 @@ from scipy import stats
 from scipy.integrate import quad
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.compiler.lowering.observation import conditional_moments
 from pymc_statespace_filters.compiler.lowering.symbols import symbols_of
+from pymc_statespace_filters.ops.base import kernel
+from pymc_statespace_filters.ops.likelihood import TapedLogLikelihood, TapePullback
 from pymc_statespace_filters.system.distributions import SCALAR_LAWS, law_name
 from pymc_statespace_filters.testing import kalman_log_likelihood
 from tests.distributions import TABLE
@@ -91,9 +92,9 @@ COUNTS = psf.StateSpaceModel(
 def test_the_gradient_is_that_of_the_likelihood_and_does_not_see_what_is_missing():
     observed = np.array([[4.0, 2.0], [3.0, np.nan], [np.nan, 0.0], [np.nan, np.nan]])
     record = (np.array([0, 5, 10, 20]), observed, np.zeros((0, 0)), 0.0, 0)
-    filter, system, theta = psf.IPLF(n_iterations=2), compile_system(COUNTS), np.array([0.5, 1.0])
-    forward = filter.compile_taped(system).function
-    backward = filter.compile_pullback(system).function
+    filter, theta = psf.IPLF(n_iterations=2), np.array([0.5, 1.0])
+    forward = kernel(TapedLogLikelihood(COUNTS, filter)).function
+    backward = kernel(TapePullback(COUNTS, filter)).function
 
     @njit
     def value_and_gradient(theta, steps, observed, inputs, t0, seed, terms_bar):

@@ -19,7 +19,6 @@ from pymc_statespace_filters.filters.outcomes import (
     PROCESS_NOISE,
     STATE_NOT_FINITE,
 )
-from pymc_statespace_filters.filters.signatures import PANEL
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import (
     LogLikelihood,
@@ -27,6 +26,7 @@ from pymc_statespace_filters.ops.likelihood import (
     TapedLogLikelihood,
     TapePullback,
 )
+from pymc_statespace_filters.ops.signatures import PANEL
 
 T0, SEED = np.array(0.5), np.array(0)
 

@@ -84,7 +84,7 @@ def test_what_is_packed_is_read_under_its_own_name():
 
 def call(words, address=None):
     """The status of a call with these words as plan."""
-    plan = psf.BootstrapPF(20).compile(compile_system(PAIR)).plan
+    plan = psf.BootstrapPF(20).plan_of_likelihood(compile_system(PAIR))
     vectors = [np.zeros(size, np.int64) for size in (N_RECORD, N_REQUEST, N_RESULTS)]
     vectors[1][REQUEST.sizes_only] = 1
     at = plan.address if words is None else words.ctypes.data
@@ -92,7 +92,7 @@ def call(words, address=None):
 
 
 def words_of_plan():
-    plan = psf.BootstrapPF(20).compile(compile_system(PAIR)).plan
+    plan = psf.BootstrapPF(20).plan_of_likelihood(compile_system(PAIR))
     first = np.ctypeslib.as_array((ctypes.c_int64 * N_HEADER).from_address(plan.address))
     size = int(first[HEADER.n_words])
     return np.array((ctypes.c_int64 * size).from_address(plan.address), np.int64)
@@ -101,8 +101,8 @@ def words_of_plan():
 def test_plans_of_equal_code_are_the_same_words():
     """The words of the first one must not be freed when a second one is made."""
     filter = psf.BootstrapPF(20)
-    plans = [filter.compile(compile_system(PAIR)).plan for _ in range(2)]
-    plans.append(filter.compile(compile_system(pair())).plan)
+    plans = [filter.plan_of_likelihood(compile_system(PAIR)) for _ in range(2)]
+    plans.append(filter.plan_of_likelihood(compile_system(pair())))
     assert len({plan.address for plan in plans}) == 1
     assert len({id(plan) for plan in plans}) > 1
 

@@ -11,9 +11,10 @@ from numpy.polynomial import Polynomial
 from scipy.stats import kstest, norm, poisson
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.filters.outcomes import NONE, TOO_FAR, Failure
 from pymc_statespace_filters.filters.point_mass.segments import POINTS, draw, points_of, weight
+from pymc_statespace_filters.ops.base import evaluator
+from pymc_statespace_filters.ops.states import Predictions, States
 from tests.references.fixed_nodes import FixedNodes
 
 MOMENTS = ("predicted", "filtered", "smoothed")
@@ -146,10 +147,10 @@ def test_terms_are_those_of_dense_matrices(name, tolerance):
     np.testing.assert_allclose(terms, np.array(reference.terms)[steps], rtol=0.0, atol=atol)
 
 
-def compiled(name, method, *arguments, filter=psf.GridFilter()):  # noqa: B008 (it is frozen)
-    """A compiled function of the filter, as a function of further arguments."""
+def compiled(name, kind, *arguments, filter=psf.GridFilter()):  # noqa: B008 (it is frozen)
+    """An operation of the filter, as a function of further arguments."""
     model, steps, observed, _ = case(name)
-    function = getattr(filter, method)(compile_system(model), *arguments)
+    function = evaluator(kind(model, filter, *arguments))
     record = np.empty(0), steps.astype(np.int64), observed[:, None], np.empty((steps[-1] + 1, 0))
     return lambda *rest: function(*record, 0.0, 0, *rest)
 
@@ -159,7 +160,7 @@ def compiled(name, method, *arguments, filter=psf.GridFilter()):  # noqa: B008 (
 def test_states_are_those_of_dense_matrices(name, moment):
     _, steps, _, reference = case(name)
     rows = np.arange(1, steps[-1] + 1)  # step 0 of one case is known, which nodes cannot hold
-    mean, sd, _, n_effective, health = compiled(name, "compile_states", moment)(rows, 0)
+    mean, sd, _, n_effective, health = compiled(name, States, moment)(rows, 0)
     law, atol = reference.law(moment), ATOL.get(name, 1e-7)
     np.testing.assert_array_equal(health, [np.inf, NONE, -1.0])
     assert (n_effective == np.inf).all()
@@ -169,7 +170,7 @@ def test_states_are_those_of_dense_matrices(name, moment):
 
 def test_a_known_start_is_drawn_as_it_is():
     for moment in MOMENTS:
-        mean, sd, drawn, _, _ = compiled("ricker", "compile_states", moment)(np.arange(2), 3)
+        mean, sd, drawn, _, _ = compiled("ricker", States, moment)(np.arange(2), 3)
         assert mean[0, 0] == drawn[0, 0] == np.log(7.0)
         assert sd[0, 0] == 0.0
 
@@ -208,7 +209,7 @@ def test_smoothed_draws_are_trajectories():
     The error of the grid is a hundredth of what these can tell.
     """
     reference, rows = case("log")[3], np.array([4, 5])
-    run = compiled("log", "compile_states", "smoothed", filter=psf.GridFilter(tolerance=1e-3))
+    run = compiled("log", States, "smoothed", filter=psf.GridFilter(tolerance=1e-3))
     drawn = np.array([run(rows, seed)[2][:, 0] for seed in range(N_DRAWS)])
     for i, k in enumerate(rows):
         cdf = np.cumsum(reference.law("smoothed").density[k] * reference.weights)
@@ -222,7 +223,7 @@ def test_smoothed_draws_are_trajectories():
 @pytest.mark.parametrize("name", ["log", "log, surprise"])
 def test_laws_of_observations(name):
     _, steps, observed, reference = case(name)
-    mean, cov, below, above = compiled(name, "compile_predictions")()
+    mean, cov, below, above = compiled(name, Predictions)()
     x, weights = reference.x, reference.weights
     for j, k in enumerate(steps):
         mass = reference.law("predicted").density[k] * weights

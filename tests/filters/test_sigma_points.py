@@ -14,16 +14,16 @@ from numba import njit
 from scipy.stats import norm
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.filters.gaussian.linearization import (
     Linearizations,
     Tangent,
     linearizations_of,
 )
 from pymc_statespace_filters.filters.gaussian.sigma_points import SigmaPoints
-from pymc_statespace_filters.filters.signatures import POINTS
-from pymc_statespace_filters.ops.base import evaluator
-from pymc_statespace_filters.ops.likelihood import LogLikelihood
+from pymc_statespace_filters.ops.base import evaluator, kernel
+from pymc_statespace_filters.ops.likelihood import LogLikelihood, TapedLogLikelihood, TapePullback
+from pymc_statespace_filters.ops.signatures import POINTS
+from pymc_statespace_filters.ops.states import States as StatesOp
 from pymc_statespace_filters.testing import kalman_log_likelihood
 from tests.filters.test_ekf_states import (
     FORCE,
@@ -71,9 +71,8 @@ class Evaluation(NamedTuple):
 @cache
 def both_passes(filter, system):
     """The function (theta, record, terms_bar) -> terms, health, tape and gradient."""
-    compiled = compile_system(system)
-    forward = filter.compile_taped(compiled).function
-    backward = filter.compile_pullback(compiled).function
+    forward = kernel(TapedLogLikelihood(system, filter)).function
+    backward = kernel(TapePullback(system, filter)).function
 
     @njit
     def run(theta, steps, observed, inputs, t0, seed, terms_bar):
@@ -130,8 +129,7 @@ def states():
 
     def run(filter, moment, params, draw_seed=0):
         if (filter, moment) not in compiled:
-            function = filter.compile_states(compile_system(SYSTEM), moment).function
-            compiled[filter, moment] = function
+            compiled[filter, moment] = evaluator(StatesOp(SYSTEM, filter, moment))
         return States(*compiled[filter, moment](theta_of(params), *RECORD, ROWS, draw_seed))
 
     return run
@@ -212,7 +210,7 @@ def test_one_iteration_of_iplf_is_the_update_of_ukf():
     The tape has the mean and the covariance before every prediction and every update.
     """
     ukf = evaluate(psf.UKF(), theta_of(NONLINEAR)).tape
-    forward = psf.IPLF(n_iterations=1).compile_taped(compile_system(SYSTEM)).function
+    forward = evaluator(TapedLogLikelihood(SYSTEM, psf.IPLF(n_iterations=1)))
     _, _, iplf = forward(theta_of(NONLINEAR), *RECORD)
     assert len(ukf) == STEPS[-1] + len(STEPS)
     np.testing.assert_allclose(iplf, ukf, rtol=1e-10, atol=1e-12)

@@ -14,7 +14,7 @@ from pytensor.tensor.blockwise import Blockwise
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.codegen.arguments import LANES
-from pymc_statespace_filters.filters import signatures
+from pymc_statespace_filters.ops import signatures
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood, LogLikelihoodGradient
 from tests.systems import PAIR, PAIR_DATA, STEPS

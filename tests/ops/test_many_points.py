@@ -1,13 +1,10 @@
 """Values and gradients at arrays of points: the numbers of each point alone."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.filters import signatures
-from pymc_statespace_filters.ops import many_points
+from pymc_statespace_filters.ops import many_points, signatures
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.ops.many_points import gradients, values
@@ -23,19 +20,6 @@ FAILS = np.array([1e300, 0.2])
 ROWS = np.array([[9, 0, 0], [9, 2, 0], [9, 3, 0], [9, 6, 0], [-4, 1, 2], [-4, 3, 2]])
 PANEL = (ROWS, np.append(FORCED_DATA, [0.3, 1.1])[:, None], FORCE[:, None], *RECORD[3:])
 PANELS = rng.uniform(-0.9, 0.9, (6, 2, 1))
-
-
-@dataclass(frozen=True)
-class InTurn:
-    """An EKF that evaluates one point at a time, as a filter of a user may."""
-
-    noisy = False
-    has_gradient = True
-
-    def __getattr__(self, name):
-        if name == "plan_of_many":
-            raise AttributeError(name)
-        return getattr(psf.EKF(), name)
 
 
 def lead(record, n=1):
@@ -152,14 +136,10 @@ def test_records_that_differ_are_evaluated_in_turn(evaluations):
     assert evaluations == of_one
 
 
-@pytest.mark.parametrize("filter", [InTurn(), psf.BootstrapPF(20)], ids=["InTurn", "BootstrapPF"])
-def test_filters_of_single_points_are_evaluated_in_turn(filter, evaluations):
-    op = LogLikelihood(PAIR, filter)
+def test_filters_of_single_points_are_evaluated_in_turn(evaluations):
+    op = LogLikelihood(PAIR, psf.BootstrapPF(20))
     assert_same(values(op, POINTS[:3], *lead(RECORD)), alone(op, POINTS[:3], RECORD))
     assert evaluations == ["LogLikelihood, one record"] * 3
-    if filter.has_gradient:
-        found = gradients(op.gradient(), POINTS[:3], *lead(RECORD), BARS[:3])
-        assert_same(found, alone(op.gradient(), POINTS[:3], RECORD, BARS[:3]))
 
 
 def test_a_record_without_rows():

@@ -13,6 +13,7 @@ from pymc_statespace_filters.ops.likelihood import (
     LogLikelihood,
     LogLikelihoodGradient,
     LogLikelihoodOfNoise,
+    StoredNoise,
 )
 
 STEPS = np.arange(1, 13)
@@ -90,7 +91,7 @@ def test_stored_normals_give_the_estimate_of_their_seed():
     """The start has places for its own number of normals."""
     arguments = np.array([3.0]), STEPS, OBSERVED, INPUTS, 0.0
     terms = evaluator(LogLikelihood(PATIENTS, FILTER))(*arguments, 7)[0]
-    normals = FILTER.stored_noise(compile_system(PATIENTS)).function(STEPS, 7)
+    (normals,) = evaluator(StoredNoise(PATIENTS, FILTER))(STEPS, 7)
     assert FILTER.noise_sizes(compile_system(PATIENTS)).initial == 2
     held = evaluator(LogLikelihoodOfNoise(PATIENTS, FILTER))(*arguments, normals)[0]
     np.testing.assert_array_equal(held, terms)

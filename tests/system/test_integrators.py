@@ -11,6 +11,8 @@ from scipy.linalg import expm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.ops.base import kernel
+from pymc_statespace_filters.ops.likelihood import LogLikelihoodGradient
 from pymc_statespace_filters.pymc_model.step_refinement import path_eigenvalues
 
 BLOCK = 64  # columns of an ensemble are padded to whole blocks
@@ -441,8 +443,10 @@ COMPOSED = ("EulerMaruyama", "RungeKutta4", "SemiImplicitEuler")
 def test_the_gradient_of_the_ekf_is_that_of_finite_differences(name):
     system, steps = every(name), 1e-5 * np.eye(2)
     inputs = np.array([[0.3], [-1.0], [2.0], [0.5]])[:, : system.n_inputs]
-    machine, point = compile_system(system), np.array([4.0, 0.6])
-    gradient = psf.EKF().compile_gradient(machine).function
+    point, gradient = (
+        np.array([4.0, 0.6]),
+        kernel(LogLikelihoodGradient(system, psf.EKF())).function,
+    )
     found = numba.njit(lambda *arguments: gradient(*arguments))(
         point, STEPS, Y, inputs, 0.0, 0, np.array([1.0, -2.0])
     )

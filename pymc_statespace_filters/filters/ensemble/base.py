@@ -10,12 +10,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ...compiler.native.plan import Plan
-from ...compiler.native.planned_function import PlannedFunction
 from ...compiler.numerics.normals import BLOCK, padded
 from ...errors import ModelError
 from ...system.checks import is_integer
 from ..protocol import System, check_sensor_has_noise
-from ..signatures import NORMALS, TERM_HEALTH
 from ..state_law import Layout, exact_states
 from . import ancestral_smoother, backward_simulation
 from .ancestral_smoother import CARRY_PAST, LAG
@@ -117,11 +115,6 @@ class EnsembleFilterBase(PartsFilter):
         sizes = self.algorithm(system).noise_sizes(system)
         return n_stored.py_func(sizes, n_steps, n_observations)
 
-    def stored_noise(self, system: System) -> PlannedFunction:
-        """Compile the function (steps, seed) -> the normals that an evaluation with it uses."""
-        plan = self.algorithm(system).plan(system, STORE_NORMALS, ())
-        return PlannedFunction(plan, *NORMALS)
-
-    def compile_health(self, system: System) -> PlannedFunction:
-        """Compile the effective number behind every term of `compile`."""
-        return PlannedFunction(self.algorithm(system).evaluation(system), *TERM_HEALTH)
+    def plan_of_noise(self, system: System) -> Plan:
+        """Plan the function (steps, seed) -> the normals that an evaluation with it uses."""
+        return self.algorithm(system).plan(system, STORE_NORMALS, ())

@@ -7,11 +7,9 @@ import numpy as np
 
 from ...compiler.native.entry_point import EntryPoint
 from ...compiler.native.plan import Plan
-from ...compiler.native.planned_function import PlannedFunction
 from ...errors import ModelError
 from ..plan import make_plan
 from ..protocol import System
-from ..signatures import LIKELIHOOD, RUN, STATES
 from ..state_law import Layout, StateLaw, gaussian_states, law_of_parts
 from .noise import NO_NOISE, NoiseSizes
 from .summaries import LAST_EVENTS, STATES_OF_PARTS, SUMMARISE
@@ -90,22 +88,23 @@ class PartsFilter:
         """Return below which fraction of the members to resample, and the number of the scheme."""
         return -1.0, 0
 
-    # Functions with plans
+    # Plans
 
-    def compile(self, system: System) -> PlannedFunction:
-        """Compile the log-likelihood."""
-        return PlannedFunction(self.algorithm(system).evaluation(system), *LIKELIHOOD)
+    def plan_of_likelihood(self, system: System) -> Plan:
+        """Plan the log-likelihood."""
+        filter = self.algorithm(system)
+        return filter.plan(system, filter.entry, filter.functions())
 
-    def compile_states(self, system: System, moment: str) -> PlannedFunction:
-        """Compile "predicted", "filtered" or "smoothed" states."""
+    def plan_of_states(self, system: System, moment: str) -> Plan:
+        """Plan "predicted", "filtered" or "smoothed" states."""
         filter = self.algorithm(system)
         if moment == "smoothed":
-            return PlannedFunction(filter.smoother(system), *STATES)
-        return PlannedFunction(filter.summarised(system, moment), *STATES)
+            return filter.smoother(system)
+        return filter.summarised(system, moment)
 
-    def compile_run(self, system: System) -> PlannedFunction:
-        """Compile one run with all that it computes."""
-        return PlannedFunction(self.algorithm(system).summarised(system, "filtered"), *RUN)
+    def plan_of_run(self, system: System) -> Plan:
+        """Plan one run with all that it computes."""
+        return self.algorithm(system).summarised(system, "filtered")
 
     def summarised(self, system: System, moment: str) -> Plan:
         """Return the plan of a run that writes "predicted" or "filtered" states."""
@@ -116,10 +115,6 @@ class PartsFilter:
         """Return the names of the system's functions that the entry calls."""
         simulated = ("observe",) if self.simulates else ()
         return "initialise", "propagate", "log_density", *simulated
-
-    def evaluation(self, system: System) -> Plan:
-        """Return the plan of the filter's entry point for one system."""
-        return self.plan(system, self.entry, self.functions())
 
     def observed(
         self,

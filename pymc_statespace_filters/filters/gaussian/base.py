@@ -13,11 +13,9 @@ from ...compiler.lowering.observation import observation_log_density
 from ...compiler.lowering.symbols import call, symbols_of
 from ...compiler.native.entry_point import EntryPoint
 from ...compiler.native.plan import Plan
-from ...compiler.native.planned_function import PlannedFunction
 from ...errors import ModelError
 from ...system.model import StateSpaceModel
 from ..protocol import System, check_sensor_has_noise
-from ..signatures import RUN, STATES
 from ..state_law import StateLaw, law_of_moments
 from ..taped import TapedFilter
 from .backward import BACKWARD
@@ -61,29 +59,27 @@ class GaussianFilterBase(TapedFilter):
         return system.is_smooth
 
     def plan_of_pass(
-        self, system: System, *, leaves_tape: bool = False, goes_back: bool = False
+        self,
+        system: System,
+        *,
+        of_many: bool = False,
+        leaves_tape: bool = False,
+        goes_back: bool = False,
     ) -> Plan:
         """Plan a pass along a record; one that leaves a tape and goes back is the gradient."""
-        return self._plan(system, BACKWARD if goes_back else FORWARD, leaves_tape=leaves_tape)
-
-    def plan_of_many(
-        self, system: System, *, leaves_tape: bool = False, goes_back: bool = False
-    ) -> Plan:
-        """Plan a pass along many records, or of many points, side by side if that fits."""
         runs = BACKWARD if goes_back else FORWARD
-        return self._plan(system, runs, of_many=True, leaves_tape=leaves_tape)
+        return self._plan(system, runs, of_many=of_many, leaves_tape=leaves_tape)
 
-    def compile_states(self, system: System, moment: str) -> PlannedFunction:
-        """Compile "predicted", "filtered" or "smoothed" states; smoothed draws are paths."""
+    def plan_of_states(self, system: System, moment: str) -> Plan:
+        """Plan "predicted", "filtered" or "smoothed" states; smoothed draws are paths."""
         if system.is_deterministic:
-            return PlannedFunction(self._plan(system, (RUN_STATES,)), *STATES)
+            return self.plan_of_run(system)
         recursion = self._functions(system)
-        plan = states_plan(system, recursion, self._linearizations(system), moment)
-        return PlannedFunction(plan, *STATES)
+        return states_plan(system, recursion, self._linearizations(system), moment)
 
-    def compile_run(self, system: System) -> PlannedFunction:
-        """Compile one run with all that it computes."""
-        return PlannedFunction(self._plan(system, (RUN_STATES,)), *RUN)
+    def plan_of_run(self, system: System) -> Plan:
+        """Plan one run with all that it computes."""
+        return self._plan(system, (RUN_STATES,))
 
     def law_of_state(self, system: System, states: np.ndarray) -> StateLaw:
         """Return the law of the state, from what the filter leaves (m, S) at m points."""
