@@ -2,8 +2,9 @@
 
 Run by `make release-check`, with a network on which pip finds its packages. Needs git and nothing
 else beside Python; works on Linux, macOS and Windows. Leaves the wheel, the sdist and the recipe of
-conda-forge in dist/. With `--quick`, as `make release-quick` and continuous integration run it, the
-contents and metadata alone are checked, in seconds and by the environment that runs it.
+conda-forge in dist/, and on Linux and x86-64 a second wheel, with machine code for this Python.
+With `--quick`, as `make release-quick` and continuous integration run it, the contents and metadata
+alone are checked, in seconds and by the environment that runs it.
 """
 
 import hashlib
@@ -26,6 +27,8 @@ PACKAGE = "pymc_statespace_filters"
 # 1.28 MB when this was set, and 5 %: who adds more makes the package smaller elsewhere, or says
 # here what is worth the bytes that every user loads.
 MAX_WHEEL_BYTES = 1_350_000
+MAX_BYTES_WITH_CODE = 15_000_000  # 8.2 MB when this was set
+CODE = f"{PACKAGE}/_machine_code/"
 
 # The parts of the suite that the installed package is held to: each layer once, and all that
 # depends on the operating system.
@@ -50,6 +53,9 @@ for variant in Stage0Recipe.from_file(sys.argv[1]).render():
     print(recipe.package.name, recipe.package.version)
 """
 
+# Variables that begin so could lead to the checkout, or change what is compiled.
+_LEADING = ("PYTHON", "PYTENSOR", "NUMBA")
+
 
 class Environment:
     """A virtual environment; what runs in it sees no variable that could lead to the checkout."""
@@ -58,11 +64,11 @@ class Environment:
         venv.create(folder, with_pip=True)
         self.folder = folder
         self._scripts = folder / ("Scripts" if os.name == "nt" else "bin")
-        kept = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "PYTENSOR"))}
+        kept = {k: v for k, v in os.environ.items() if not k.startswith(_LEADING)}
         path = os.pathsep.join([str(self._scripts), os.environ.get("PATH", "")])
         self._variables = kept | {"PATH": path} | variables
 
-    def run(self, *command: str | Path, cwd: Path | None = None) -> None:
+    def run(self, *command: str | Path, cwd: Path | None = None, **variables: str) -> None:
         """Run a command of the environment, as ``python -m pip``."""
         program = shutil.which(str(command[0]), path=str(self._scripts))
         if program is None:
@@ -70,7 +76,7 @@ class Environment:
         done = subprocess.run(
             [program, *map(str, command[1:])],
             cwd=cwd or self.folder,
-            env=self._variables,
+            env=self._variables | variables,
             check=False,
         )
         if done.returncode:
@@ -110,14 +116,14 @@ def tracked_files() -> set[str]:
     return set(listed.stdout.split("\0")) - {""}
 
 
-def check_wheel(wheel: Path) -> None:
+def check_wheel(wheel: Path, limit: int = MAX_WHEEL_BYTES) -> None:
     """The package, its metadata and its licence; nothing else, and not much of it."""
     size = wheel.stat().st_size
     print(f"{wheel.name}: {size} bytes")
-    require(size < MAX_WHEEL_BYTES, f"{wheel.name} has {size} bytes, not below {MAX_WHEEL_BYTES}")
+    require(size < limit, f"{wheel.name} has {size} bytes, not below {limit}")
     info = "-".join(wheel.name.split("-")[:2]) + ".dist-info/"
     with zipfile.ZipFile(wheel) as archive:
-        names = set(archive.namelist())
+        names = {name for name in archive.namelist() if not name.startswith(CODE)}
     sources = {name for name in tracked_files() if name.startswith(f"{PACKAGE}/")}
     metadata = {info + name for name in ("METADATA", "WHEEL", "RECORD", "licenses/LICENSE")}
     compare(wheel, names, sources | metadata)
@@ -175,6 +181,59 @@ def unpacked(sdist: Path, folder: Path) -> Path:
     return top
 
 
+def with_machine_code(wheel: Path, code: Path, user: Environment, tools: Environment) -> Path:
+    """The wheel with a folder of machine code, for the Python and the systems of numba's wheel."""
+    tools.run("wheel", "unpack", wheel, "-d", code.parent / "tree")
+    (tree,) = (code.parent / "tree").iterdir()
+    shutil.copytree(code, tree / CODE)
+    (of_numba,) = user.folder.rglob("numba-*.dist-info/WHEEL")
+    lines = of_numba.read_text(encoding="utf-8").splitlines()
+    tags = "\n".join(line for line in lines if line.startswith("Tag: "))
+    (own,) = tree.glob("*.dist-info/WHEEL")
+    text = own.read_text(encoding="utf-8").replace("Tag: py3-none-any", tags)
+    text = text.replace("Root-Is-Purelib: true", "Root-Is-Purelib: false")
+    own.write_text(text, encoding="utf-8")
+    before = set(DIST.iterdir())
+    tools.run("wheel", "pack", tree, "-d", DIST)
+    (packed,) = set(DIST.iterdir()) - before
+    return packed
+
+
+def run_readme(environment: Environment, cache: Path) -> None:
+    """Run the example of the README on an empty cache, and say what it took."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    example = readme.partition("```python\n")[2].partition("```")[0]
+    took = "import time\nprint(f'README, empty cache: {time.process_time():.1f} CPU s')\n"
+    program = cache.with_suffix(".py")
+    program.write_text(example + took, encoding="utf-8")
+    flags = f"base_compiledir={cache.as_posix()},cxx="
+    environment.run("python", program, PYTENSOR_FLAGS=flags)
+
+
+def check_machine_code(wheel: Path, user: Environment, tools: Environment, work: Path) -> None:
+    """Build the wheel with machine code, if this system has one, and install it elsewhere.
+
+    Its code gives the numbers of own compilation, and nothing of the README is compiled by numba.
+    """
+    code, script = work / "machine_code", work / "machine_code.py"
+    shutil.copy(ROOT / "packaging" / script.name, work)
+    user.run("python", script, "build", code)
+    if not code.exists():
+        print("there is no machine code for this system")
+        return
+    packed = with_machine_code(wheel, code, user, tools)
+    tools.run("twine", "check", "--strict", packed)
+    check_wheel(packed, MAX_BYTES_WITH_CODE)
+    other = Environment(work / "other", MPLBACKEND="agg")
+    other.install(packed)
+    check_origin(other)
+    other.run("python", script, "check")
+    for environment in (user, other):
+        run_readme(environment, environment.folder.with_suffix(".cache"))
+    compiled = [file.name for file in (work / "other.cache").rglob("*.nbi")]
+    require(not compiled, f"{packed.name} has no code of {', '.join(compiled)}")
+
+
 def check_metadata(wheel: Path) -> None:
     """The metadata are valid, and say which Python, licence and description they are of."""
     from packaging.metadata import Metadata
@@ -226,6 +285,8 @@ def main() -> None:
         with step("first run"):
             shutil.copy(ROOT / "packaging" / "smoke.py", work)
             user.run("python", "-W", "error", work / "smoke.py")
+        with step("machine code"):
+            check_machine_code(wheel, user, tools, work)
         with step("doctests of the wheel"):
             user.install(f"{wheel}[test]")
             tests = unpacked(sdist, work / "unpacked")

@@ -18,6 +18,7 @@ import pytensor
 from pytensor.link.numba.cache import NUMBA_CACHE_PATH
 
 from .outside_code import UnknownValueError, identity_of
+from .shipped_code import FOLDER
 
 # Numba's own index on disk tells processors and versions of Python apart.
 _COMPILERS = (numba.__version__, llvmlite.__version__, pytensor.__version__)
@@ -44,7 +45,7 @@ class Sources:
 
     It takes a second to parse all files. A file in ``folder`` therefore keeps what was found in
     them, for other processes that read the same contents in the same way: the name of the file
-    follows from the text of this module.
+    follows from the text of this module. A wheel with machine code has such a file, too.
     """
 
     def __init__(self, package: Path, folder: Path):
@@ -87,12 +88,14 @@ class Sources:
 
     @cached_property
     def _known(self) -> dict[str, _Source]:
-        """What earlier processes kept."""
-        try:
-            kept = json.loads(self._kept.read_text(encoding="utf-8"))
-            return {name: _Source(a, b, tuple(imports)) for name, (a, b, imports) in kept.items()}
-        except (OSError, ValueError, TypeError, AttributeError):  # no file, or a damaged one
-            return {}
+        """What earlier processes kept, or the process that made the machine code of a wheel."""
+        known: dict[str, _Source] = {}
+        for file in (self._package / FOLDER.name / self._kept.name, self._kept):
+            # There is no file, or a damaged one.
+            with suppress(OSError, ValueError, TypeError, AttributeError):
+                kept = json.loads(file.read_text(encoding="utf-8"))
+                known |= {name: _Source(a, b, tuple(of)) for name, (a, b, of) in kept.items()}
+        return known
 
     def _keep(self) -> None:
         if self._sources.items() <= self._known.items():

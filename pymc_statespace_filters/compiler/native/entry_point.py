@@ -33,6 +33,7 @@ from ...progress import slow_compilation
 from .cache_key import is_outside, key_of
 from .code_library import InternalLinkageCompiler, with_internal_linkage
 from .jit import FAST_MATH
+from .shipped_code import shipped_for
 
 F64_PTR = types.CPointer(types.float64)
 I64_PTR = types.CPointer(types.int64)
@@ -42,14 +43,23 @@ class _CacheByKey(FunctionCache):
     """A cache in PyTensor's folder that compares the key alone, and compiles anew what is damaged.
 
     Numba would also compare the closure, and compiled functions in it differ in every process.
+    What is not in the folder may have come with the package.
     """
 
     def load_overload(self, sig, target_context):
+        found = None
         try:
-            return super().load_overload(sig, target_context)
+            found = super().load_overload(sig, target_context)
         except Exception:  # whatever unpickling half a file raises, at every start again
             self.flush()
+        return found or self._shipped(sig, target_context)
+
+    def _shipped(self, signature, context):
+        code = shipped_for(context.codegen().magic_tuple())
+        if code is None:
             return None
+        content = code.load(self._impl.filename_base, self._index_key(signature, code))
+        return content and self._impl.rebuild(context, content)
 
     def _index_key(self, signature, codegen):
         return signature, codegen.magic_tuple(), CACHED_SRC_FUNCTIONS[self._py_func]

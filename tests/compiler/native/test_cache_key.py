@@ -12,6 +12,7 @@ from pymc_statespace_filters.compiler.codegen.function_types import Graph
 from pymc_statespace_filters.compiler.codegen.functions import member_function, vector_function
 from pymc_statespace_filters.compiler.native import cache_key
 from pymc_statespace_filters.compiler.native.cache_key import Sources, key_of
+from pymc_statespace_filters.compiler.native.shipped_code import FOLDER
 
 NAME = psf.__name__
 LOOP, CODE = f"{NAME}.filters.ensemble.loop", f"{NAME}.compiler.codegen.functions"
@@ -202,6 +203,13 @@ def test_sources_are_parsed_once_for_all_processes(copy, monkeypatch):
     expected = copy.start().digest_of(LOOP)
     monkeypatch.setattr(cache_key.ast, "parse", None)
     assert copy.start().digest_of(LOOP) == expected
+
+
+def test_a_wheel_with_machine_code_has_the_sources_parsed(copy, kept, monkeypatch, tmp_path):
+    expected = copy.start().digest_of(LOOP)
+    shutil.copytree(kept, copy.root / FOLDER.name)
+    monkeypatch.setattr(cache_key.ast, "parse", None)
+    assert Sources(copy.root, tmp_path / "empty").digest_of(LOOP) == expected
 
 
 def test_what_another_version_of_the_parser_kept_is_not_read(copy, monkeypatch, tmp_path):
