@@ -68,8 +68,8 @@ def _remedy(fact: EndedRun, enough: float, ways: Sequence[str]) -> str:
     if not fact.goes_on:
         more = "draw more with psf.sample(draws=..., until_ess=None), which has no limit of time"
     return (
-        f"{would_do}the run ended as twice as many would take longer than its "
-        f"{request.seconds:.0f} CPU s: {alternatives([more, *ways])}"
+        f"{would_do}the run ended as twice as many would take longer than it may: "
+        f"{alternatives([more, *ways])}"
     )
 
 

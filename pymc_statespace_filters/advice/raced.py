@@ -8,7 +8,14 @@ from .words import log, sentences, told
 
 @sentences.register
 def _(fact: Raced) -> list[str]:
-    return ["; ".join(f"{_name(run, fact)} {_outcome(run, fact)}" for run in fact.runs)]
+    kinds = [isinstance(run, EndedNuts) for run in fact.runs]
+    said = []
+    for i, run in enumerate(fact.runs):
+        # Of walks, each from the points of the one before, the last one is named.
+        if run is fact.best or kinds[i] or kinds[i + 1 : i + 2] != [False]:
+            name = "DRAM, from the better points," if any(kinds[:i]) else _first_name(run, fact)
+            said.append(f"{name} {_outcome(run, fact)}")
+    return ["; ".join(said)]
 
 
 @told.register
@@ -18,19 +25,20 @@ def _(fact: Raced, begin: str) -> list[str]:
     return said
 
 
-def _name(run: EndedRun, fact: Raced) -> str:
+def _first_name(run: EndedRun, fact: Raced) -> str:
+    """The name of a run before which no NUTS has run."""
     if isinstance(run, EndedNuts):
         return "NUTS, from its points,"
-    return "DRAM" if run is fact.runs[0] else "DRAM, from the better points,"
+    return "DRAM" if run is fact.runs[0] else "DRAM, from points of its own,"
 
 
 def _outcome(run: EndedRun, fact: Raced) -> str:
     found, n = run.convergence, run.length.n_iterations
     if isinstance(run, EndedNuts) and run.is_beaten:
         return "would take more evaluations"
-    if isinstance(run, EndedNuts) and run.diverges:
+    if isinstance(run, EndedNuts) and run is not fact.best and run.diverges:
         return f"diverged in {run.diverging.mean():.1%} of its draws"
-    if run is fact.runs[0] and run is not fact.best:
+    if not isinstance(run, EndedNuts) and run is not fact.best:
         needed = rounded(expected_iterations(run.request, run.length, found))
         return f"would take some {needed} iterations of each chain for draws worth {fact.goal:g}"
     worth = 0.0 if found is None else found.least_ess

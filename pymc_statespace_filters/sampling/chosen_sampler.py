@@ -53,11 +53,11 @@ def sample(
 ) -> DataTree | None:
     """Draw from the posterior of a model, by the sampler that suits it.
 
-    The random walk of `sample_dram` runs first, from points found as by `find_starts`. Where its
-    draws would take more than 32 ``draws`` iterations of each chain to be worth enough, and every
-    likelihood has a gradient, NUTS (of nutpie) starts at its points. Where NUTS takes more
-    evaluations than the walk would, or diverges, the walk goes on from the draws of NUTS. The
-    report says what was tried, and what came of it.
+    The random walk of `sample_dram` runs first, from points found as by `find_starts`, and again
+    from its own points where its draws are not worth enough. Where 64 ``draws`` iterations of each
+    chain are too few, and every likelihood has a gradient, NUTS (of nutpie) starts at its points.
+    Where NUTS takes more evaluations than the walk would, or diverges, the walk goes on from the
+    points that are worth most. The report says what was tried, and what came of it.
 
     A draw is the last of k iterations. First k is 1; it is doubled, and every second draw dropped,
     until the draws are worth ``until_ess``. The result has the size of ``draws``, however slowly
@@ -75,8 +75,8 @@ def sample(
         of at most 1.01. If fewer than n = 800 draws are kept in all, the limit is 1 + 8 / n.
         Default: 400, or n / 2 if that is less. None keeps the first ``draws`` iterations.
     max_draws : int, optional
-        Iterations of each chain at most. Default: 1024 times ``draws`` with the random walk, 64
-        times with NUTS. The run also ends where the next doubling would take it beyond five
+        Iterations of each chain at most, of every run of a race. Default: 1024 times ``draws`` with
+        the random walk, 64 times with NUTS. The run also ends where the next doubling would take it beyond five
         minutes of the time of each of its processors, or where chains of NUTS diverge and the last
         doubling has made them worth little more; a warning says what would do. Apart from the limit
         of time, the result and the sampler depend on ``random_seed`` and the number of chains

@@ -15,6 +15,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters import advice
 from pymc_statespace_filters.advice.remedies import reparametrise
 from pymc_statespace_filters.sampling import chosen_sampler, race
+from pymc_statespace_filters.sampling.choice import why_not_after_all
 from pymc_statespace_filters.sampling.nuts.sample_nuts import sample_nuts
 from pymc_statespace_filters.sampling.run.request import RunArguments
 from tests.sampling.test_nuts_starts import schools
@@ -55,6 +56,26 @@ def other_clock(monkeypatch):
         monkeypatch.setattr(time, clock.__name__, partial(lambda of: 100.0 * of(), clock))
 
 
+@pytest.fixture
+def nuts_follows(monkeypatch):
+    """NUTS follows a walk of as many iterations as draws, however long it takes."""
+    for name, value in {"_FIRST": 1, "_WALK": 1, "_MARGIN": np.inf, "_MOST_SPENT": np.inf}.items():
+        monkeypatch.setattr(race, name, value)
+
+
+@pytest.fixture
+def walks(monkeypatch):
+    """The requests of the walks, as they are made."""
+    made, sample_models = [], race.sample_models
+
+    def noted(models, requests, *given):
+        made.extend(requests)
+        return sample_models(models, requests, *given)
+
+    monkeypatch.setattr(race, "sample_models", noted)
+    return made
+
+
 def test_a_walk_that_is_quick_is_not_raced(caplog):
     idata, said = run(schools(centred=False), caplog)
     assert idata.attrs["sampler"] == "dram"
@@ -62,19 +83,40 @@ def test_a_walk_that_is_quick_is_not_raced(caplog):
     assert not any("NUTS, from its points" in text for text in said)
 
 
-def test_nuts_from_the_points_of_a_slow_walk(caplog, monkeypatch):
-    monkeypatch.setattr(race, "_is_too_slow", lambda walk: True)
-    monkeypatch.setattr(race, "_MARGIN", np.inf)
+def test_a_walk_goes_on_longer_from_its_own_points(caplog, walks, monkeypatch):
+    """With other random numbers, and by the draws of the last one alone, which reach the goal."""
+    monkeypatch.setattr(race, "_FIRST", 1)
+    idata, said = run(schools(centred=True), caplog)
+    assert idata.attrs["sampler"] == "dram"
+    assert idata.attrs["sampler_reason"].startswith("DRAM, from points of its own, made draws")
+    assert not any("NUTS, from its points" in text for text in said)
+    assert [walk.max_draws for walk in walks] == [1000, 4000, 16000][: len(walks)]
+    assert len({tuple(walk.entropy) for walk in walks}) == len(walks) > 1
+    assert walks[0].pilot is None
+    assert np.shape(walks[1].pilot) == (4000, 10)
+
+
+def test_what_a_race_takes_is_bounded(caplog, walks):
+    """Draws that are never worth enough: the walks at the end take no more than all before them."""
+    call = {"draws": 20, "tune": 40, "chains": 2, "until_ess": 40.0}
+    _, said = run(schools(centred=False), caplog, **call)
+    (told,) = (text for text in said if text.startswith("DRAM, from points of its own, would take"))
+    assert "DRAM, from the better points," in told
+    made = [walk.max_draws // 20 for walk in walks]
+    assert made[:3] == [4, 16, 64]
+    most = 84 * (1 + race._MOST_SPENT) + 2000  # which NUTS makes before it is looked at
+    assert 0 < sum(made[3:]) < 4 / 3 * most
+
+
+def test_nuts_from_the_points_of_a_slow_walk(caplog, nuts_follows):
     idata, said = run(stiff(), caplog, draws=250)
     (told,) = (text for text in said if "NUTS, from its points, made draws worth" in text)
     assert idata.attrs["sampler_reason"] == told.removesuffix(".")
     assert not any("until_ess" in text for text in said)  # what the other lacks nobody needs
 
 
-def test_no_clock_decides(request, caplog, monkeypatch):
+def test_no_clock_decides(request, caplog, nuts_follows, monkeypatch):
     monkeypatch.setattr(chosen_sampler, "TIME_LIMIT", np.inf)  # which alone depends on one
-    monkeypatch.setattr(race, "_is_too_slow", lambda walk: True)
-    monkeypatch.setattr(race, "_MARGIN", np.inf)
     call = {"draws": 100, "tune": 200}
     first = run(stiff(), caplog, **call)[0]
     request.getfixturevalue("other_clock")
@@ -83,10 +125,8 @@ def test_no_clock_decides(request, caplog, monkeypatch):
     xr.testing.assert_equal(again["posterior"].to_dataset(), first["posterior"].to_dataset())
 
 
-def test_the_walk_goes_on_where_nuts_diverges(caplog, monkeypatch):
+def test_the_walk_goes_on_where_nuts_diverges(caplog, nuts_follows):
     """At a neck, from the draws of NUTS; each has been tried, so no message sends to the other."""
-    monkeypatch.setattr(race, "_WALK", 1)
-    monkeypatch.setattr(race, "_MARGIN", np.inf)
     idata, said = run(schools(centred=True), caplog)
     (told,) = (text for text in said if "DRAM, from the better points," in text)
     assert "NUTS, from its points, diverged in" in told
@@ -95,13 +135,16 @@ def test_the_walk_goes_on_where_nuts_diverges(caplog, monkeypatch):
     assert not any("sampler=" in text or "psf.sample" in text for text in said)
 
 
-def test_the_walk_goes_on_from_its_own_points_where_nuts_cannot_follow(caplog, monkeypatch):
-    monkeypatch.setattr(race, "_WALK", 1)
+def test_why_nuts_cannot_follow_after_all():
+    assert why_not_after_all(staircase()) == "the likelihood is a staircase of year"
+    assert why_not_after_all(stiff(2)) == ""
+
+
+def test_the_walk_goes_on_from_its_own_points_where_nuts_cannot_follow(caplog, nuts_follows):
     idata, said = run(staircase(), caplog, draws=250)
     assert idata.attrs["sampler"] == "dram"
     assert idata.attrs["sampler_reason"] == "the likelihood is a staircase of year"
-    (told,) = (text for text in said if "DRAM, from the better points, made draws worth" in text)
-    assert told.startswith("DRAM would take some")
+    assert any(text.startswith("DRAM, from points of its own, made draws worth") for text in said)
     assert not any("NUTS, from its points, " in text for text in said[1:])
 
 

@@ -31,6 +31,8 @@ from ...parallel.signals import keeps_what_is_there
 from ..checkpoint.checkpoint import open_checkpoint
 from ..output.facts import WithoutDraws
 from ..target.leader_follower import follow, release_followers
+from ..target.record_target import RecordTarget
+from ..target.target import Target
 from .model_task import ModelTask
 from .request import ExecutionOptions, SamplingRequest
 from .scheduler import run_chains
@@ -48,11 +50,13 @@ def sample_models(
     requests: Sequence[SamplingRequest],
     options: ExecutionOptions,
     checkpoints: Sequence[str | os.PathLike],
+    target: Target | RecordTarget | None = None,
 ) -> dict[str, DataTree] | None:
     """Sample models on all ranks of a communicator; None on ranks that do not get the result.
 
     ``requests`` has one for each model, of as many draws and chains; ``checkpoints`` has a folder
-    for each model, or none. Errors are those of ``sample_dram``.
+    for each model, or none. A single model may have its ``target`` already. Errors are those of
+    ``sample_dram``.
     """
     options.check()
     ranks = options.ranks
@@ -68,7 +72,7 @@ def sample_models(
             else:
                 with release_followers(group), leaders:
                     tasks = [
-                        ModelTask(model, request._replace(entropy=entropy), name, group)
+                        ModelTask(model, request._replace(entropy=entropy), name, group, target)
                         for (name, model), request in zip(models.items(), requests, strict=True)
                     ]
                     trees = _run(tasks, leaders, options, checkpoints)

@@ -57,7 +57,7 @@ class ModelTask:
         For messages; empty if there is only one model.
     group : Communicator, optional
         Ranks that evaluate the likelihoods together, of which this is the first.
-    target : Target, optional
+    target : Target or RecordTarget, optional
         The model's, if it has been made already.
 
     Raises
@@ -72,7 +72,7 @@ class ModelTask:
         request: SamplingRequest,
         name: str = "",
         group: Communicator | None = None,
-        target: Target | None = None,
+        target: Target | RecordTarget | None = None,
     ):
         check_no_generators(model)
         self.model, self.request, self.name = model, request, name

@@ -52,8 +52,6 @@ class SamplingRequest(NamedTuple):
     thin: int = 1  # iterations of which a draw is the last
     # With until_ess: whether thin is doubled, until max_draws iterations, and not more draws made.
     doubles_thin: bool = False
-    # With doubles_thin: whether to end as soon as max_draws iterations are expected not to do.
-    gives_up: bool = False
     seconds: float = math.inf  # of processors, that doubling may take
     former: FormerChains | None = None  # that are to go on
 

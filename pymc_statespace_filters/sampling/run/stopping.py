@@ -14,9 +14,6 @@ ENOUGH = 400.0
 # Independent draws show nine tenths of their number, or two thirds if they are few, and in 99 of
 # 100 cases an R-hat below 1 + 8 / n, for n draws in one chain or in four.
 _SHOWN_SHARE, _SHOWN_RHAT = 0.5, 8.0
-# Iterations of a draw from which it is known what more of them will do, within this factor: as long
-# as one chain is on a detour, all draws look worth next to nothing.
-_LEAST_SEEN, _UNKNOWN = 4, 4.0
 
 
 class Length(NamedTuple):
@@ -85,13 +82,6 @@ def expected_iterations(
     return length.n_iterations * (request.until_ess or 0.0) / max(least_ess, 1.0)
 
 
-def is_hopeless(request: SamplingRequest, length: Length, found: Convergence | None) -> bool:
-    """Whether ``max_draws`` iterations will not be enough."""
-    expected = expected_iterations(request, length, found)
-    most = request.max_draws or request.draws
-    return length.thin >= _LEAST_SEEN and expected > _UNKNOWN * most
-
-
 def next_length(
     request: SamplingRequest, length: Length, found: Convergence | None, seconds: float
 ) -> Length | None:
@@ -102,8 +92,6 @@ def next_length(
     if is_enough(request, found) or request.max_draws is None:
         return None
     if request.doubles_thin:
-        if request.gives_up and is_hopeless(request, length, found):
-            return None
         longer = length._replace(thin=2 * length.thin)
         is_short = longer.n_iterations <= request.max_draws
         return longer if is_short and 2.0 * seconds <= request.seconds else None
