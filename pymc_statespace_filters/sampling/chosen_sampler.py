@@ -76,11 +76,11 @@ def sample(
         Default: 400, or n / 2 if that is less. None keeps the first ``draws`` iterations.
     max_draws : int, optional
         Iterations of each chain at most, of every run of a race. Default: 1024 times ``draws`` with
-        the random walk, 64 times with NUTS. The run also ends where the next doubling would take it beyond five
-        minutes of the time of each of its processors, or where chains of NUTS diverge and the last
-        doubling has made them worth little more; a warning says what would do. Apart from the limit
-        of time, the result and the sampler depend on ``random_seed`` and the number of chains
-        alone: the race counts evaluations.
+        the random walk, 64 times with NUTS. The run also ends where the next doubling would
+        take it beyond five minutes of the time of each of its processors, or where chains of NUTS
+        diverge and the last doubling has made them worth little more; a warning says what would do.
+        Apart from the limit of time, the result and the sampler depend on ``random_seed`` and the
+        number of chains alone: the race counts evaluations.
     chains, cores : int
         Number of chains, and of those that run at a time. Default: as many as there are processors.
     sampler : {"auto", "nuts", "dram"}
