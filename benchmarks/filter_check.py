@@ -28,7 +28,7 @@ from pymc_statespace_filters.checks.filters.checks import check_model, outcomes_
 TABLE = Path(__file__).parents[1] / "docs" / "_static" / "filter_check.inc"
 FILTERS = (psf.EKF(), psf.UKF(), psf.IPLF(), psf.EnKF(200), psf.GuidedPF(100))
 BAD, GOOD = 3.0, 1.0  # nats
-SECONDS = 2.0  # as at the end of a run
+SECONDS = 1.0  # as at the end of a run
 SPREADS = np.linspace(0.5, 0.99, 25)  # of the unknown parameter
 N_COMPARED = 10  # draws
 

@@ -83,7 +83,7 @@ def run_models(
     **settings
         The other arguments of the sampler, for every model; of `sample` ``draws``, ``tune``,
         ``until_ess``, ``max_draws``, ``chains``, ``cores``, ``kernel``, ``initvals``,
-        ``random_seed`` and ``progressbar``, of `sample_dram` also ``thin``,
+        ``random_seed``, ``progressbar`` and ``check``, of `sample_dram` also ``thin``,
         ``discard_tuned_samples`` and ``compute_convergence_checks``. A model's draws are those of
         the sampler with the same seed and do not depend on the other models; with ``until_ess``
         each stops on its own.

@@ -98,6 +98,14 @@ def interpreted():
 
 
 @pytest.fixture
+def without_compilation(monkeypatch):
+    """The check at the end of a run takes all filters for compiled ones, whatever is on disk."""
+    from pymc_statespace_filters.pymc_model.filter_estimates import VariableAtPoints
+
+    monkeypatch.setattr(VariableAtPoints, "is_compiled", lambda variable, filter: True)
+
+
+@pytest.fixture
 def interrupts_arrive():
     """A shell has them ignored in what it runs in the background."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -2,13 +2,12 @@
 
 from functools import partial
 
-from ..checks.filters.filter_facts import UsedFilters
 from ..parallel.signals import is_interrupted
 from ..pymc_model.inspection import have_missing_codes
 from ..sampling.output.datatree import most_iterations
 from ..sampling.output.facts import EndedDram, WithoutDraws
 from .collapse import collapse_remedies
-from .filter_check import FilterCheck, check_filters
+from .filter_check import filters_of
 from .missed import missed_of
 from .mixing import mixing_problem, until_ess_problem
 from .mobility import LOWER, STANDSTILL, chain_problems
@@ -22,15 +21,9 @@ from .words import log, sentences, told
 def _(fact: EndedDram, begin: str) -> list[str]:
     of_chains = chain_problems(fact)
     said = [*of_chains.values(), *_noise(fact)]
-    check = FilterCheck()
-    if fact.is_checked and "posterior" in fact.tree:
+    if fact.options.compute_convergence_checks and "posterior" in fact.tree:
         said += missed_of(fact)
-        n_iterations = fact.request.tune + fact.length.n_iterations
-        check = check_filters(
-            UsedFilters(
-                fact.tree, fact.model, n_iterations, fact.seconds, fact.rngs[1], None, fact.level
-            )
-        )
+    check = filters_of(fact)
     # An estimate may be far too high by chance: the level says nothing of one with noise.
     if fact.below is not None and not fact.target.seed_names:
         said.append(
@@ -43,11 +36,11 @@ def _(fact: EndedDram, begin: str) -> list[str]:
     said += _left_out(fact)
     report = closing_report(fact) if fact.chains else ""
     problems = said or check.warned or is_interrupted() or have_missing_codes(fact.model)
-    if report and fact.is_checked and not problems:
+    if report and fact.options.compute_convergence_checks and not problems:
         report += " No problems found."
     log([begin + text for text in said])
-    log([begin + report] if report else [], fact.level)
-    check.tell(fact.level, begin)
+    log([begin + report] if report else [], fact.options.level)
+    check.tell(fact.options.level, begin)
     return [*said, *check.warned]
 
 
@@ -73,7 +66,7 @@ def _mixing(fact: EndedDram) -> list[str]:
     """Chains that ended too early, or have not mixed."""
     ways = partial(ways_to_mix, fact.model, fact.names, fact.positions)
     text = until_ess_problem(fact, ways) if fact.is_complete else None
-    if text is None and fact.is_checked:
+    if text is None and fact.options.compute_convergence_checks:
         text = mixing_problem(fact, ways)
     return [] if text is None else [text]
 

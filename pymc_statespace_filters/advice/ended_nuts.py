@@ -2,12 +2,11 @@
 
 import numpy as np
 
-from ..checks.filters.filter_facts import UsedFilters
 from ..parallel.signals import is_interrupted
 from ..pymc_model.inspection import have_missing_codes
 from ..sampling.output.convergence import MAX_RHAT
 from ..sampling.output.facts import EndedNuts
-from .filter_check import check_filters
+from .filter_check import filters_of
 from .missed import missed_of
 from .mixing import mixing_problem, until_ess_problem
 from .remedies import alternatives, reaches_zero, reparametrise, without_transform
@@ -21,12 +20,7 @@ _LEAST_E_BFMI = 0.3
 @told.register
 def _(fact: EndedNuts, begin: str) -> list[str]:
     missed = missed_of(fact)
-    n_iterations = fact.request.tune + fact.length.n_iterations
-    check = check_filters(
-        UsedFilters(
-            fact.tree, fact.model, n_iterations, fact.seconds, fact.rngs[1], None, fact.level
-        )
-    )
+    check = filters_of(fact)
     bounded = reaches_zero(fact.model, fact.names, fact.positions)
     instead = "" if bounded is None else without_transform(bounded)
     said = [*_problems(fact, instead), *missed, *_too_short(fact, instead)]
@@ -35,8 +29,8 @@ def _(fact: EndedNuts, begin: str) -> list[str]:
     if is_good and not (said or is_interrupted() or have_missing_codes(fact.model)):
         report += " No problems found."
     log([begin + text for text in said])
-    log([begin + report], fact.level)
-    check.tell(fact.level, begin)
+    log([begin + report], fact.options.level)
+    check.tell(fact.options.level, begin)
     return [*said, *check.warned]
 
 

@@ -6,13 +6,14 @@ from xarray import DataTree
 
 from ..checks.filters.checks import MORE_POINTS, check_at_end, doubts, store, stored
 from ..checks.filters.filter_facts import FilterOutcomes, UsedFilters
-from ..checks.filters.finding import EXACT, OFF
+from ..checks.filters.finding import EXACT, OFF, UNDECIDED
 from ..errors import StateSpaceFiltersError
 from ..evidence.evidence_facts import CorrectingFilter, FiltersOfDraws
 from ..parallel.shared_rows import by_first_rank
 from ..parallel.signals import unless_interrupted
 from ..pymc_model.inspection import observes_state_space
 from ..pymc_model.posterior_draws import MIN_DRAWS
+from ..sampling.output.facts import EndedRun
 from .words import log, sentences, told, warn_of_filters
 
 # Runs of fewer iterations are trials.
@@ -57,6 +58,16 @@ def _(fact: UsedFilters, begin: str) -> list[str]:
     return list(found.warned)
 
 
+def filters_of(fact: EndedRun) -> FilterCheck:
+    """The check at the end of chains, unless the user wants none."""
+    is_wanted = fact.options.compute_convergence_checks and fact.options.checks_filters
+    if not is_wanted or "posterior" not in fact.tree:
+        return FilterCheck()
+    n_iterations = fact.request.tune + fact.length.n_iterations
+    of_run = n_iterations, fact.seconds, fact.rngs[1], None, fact.options.level
+    return check_filters(UsedFilters(fact.tree, fact.model, *of_run))
+
+
 def check_filters(fact: UsedFilters) -> FilterCheck:
     """Check filters at draws; the outcome is stored with these. Nothing after Ctrl-C."""
     return unless_interrupted(lambda: _check(fact), FilterCheck())
@@ -72,8 +83,9 @@ def _check(fact: UsedFilters) -> FilterCheck:
     except StateSpaceFiltersError as error:
         return FilterCheck((f"The filter was not checked: {error}",))
     store(tree, outcomes)
+    longer = {UNDECIDED: "; psf.check_filter(idata, model) takes the time for it"}
     said = [
-        f"{name}: {one['verdict']}"
+        f"{name}: {one['verdict']}{longer.get(one['outcome'], '')}"
         for name, one in outcomes.items()
         if one["outcome"] not in (OFF, EXACT)  # of an exact one nothing was compared
     ]

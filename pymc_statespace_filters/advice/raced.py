@@ -21,7 +21,7 @@ def _(fact: Raced) -> list[str]:
 @told.register
 def _(fact: Raced, begin: str) -> list[str]:
     said = [f"{begin}{text}." for text in sentences(fact)]
-    log(said, fact.best.level)
+    log(said, fact.best.options.level)
     return said
 
 

@@ -43,15 +43,19 @@ def check_filter(
     seeds, but where several explanations fit the data equally well its particles may follow one of
     them: nearly all estimates are then too low, by an amount that their spread over seeds does not
     show. Both show in a comparison with filters that are exact or unbiased: `GridFilter` for one
-    state, else `BootstrapPF`, with as many particles as some twenty seconds allow, and `GuidedPF`.
+    state, else `GuidedPF` or, where that scatters, `BootstrapPF` with as many particles as some
+    twenty seconds allow. The first that decides is enough.
 
-    Half of the points are draws, from any sampler. The others lie around them, twice or three times
-    as far from their mean, or are draws of the prior: a chain stays away from where its filter is
-    too low, so that draws cannot show it. Of these points those count at which the posterior would
-    be as high as at the draws.
+    Half of the points are draws, from any sampler; more are compared where these do not show how
+    far parameters would move. The others lie around them, twice or three times as far from their
+    mean, or are draws of the prior: a chain stays away from where its filter is too low, so that
+    draws cannot show it. Of these points those count at which the posterior would be as high as at
+    the draws.
 
-    All samplers of this package make the same check at the end of a run, with two seconds or a
-    tenth of the run's time.
+    All samplers of this package make the same check at the end of a run, with a second or a tenth
+    of the run's time, in which another filter must be compiled. Some loops of a filter are compiled
+    once per installation, in 5 to 20 seconds: a check at the end of a short run leaves that to this
+    function.
 
     Parameters
     ----------
@@ -64,10 +68,10 @@ def check_filter(
     filter : filter, optional
         Checked in place of the model's own, at the same points.
     n_draws : int
-        Number of points, at least 8.
+        Number of points to begin with, at least 8.
     random_seed : None, int or numpy.random.Generator
         Seed of the points and of the noise. The numbers follow from it, unless time was up or an
-        exact filter takes so long that time decides about it.
+        evaluation by an exact filter takes about the fiftieth of a second up to which it is used.
     progressbar : bool
         Whether to show the points that are done, if they take more than two seconds.
 
@@ -108,8 +112,9 @@ def check_filter(
     Notes
     -----
     The mean difference at draws moves the log-evidence. To first order the posterior of a parameter
-    moves by its covariance with the difference, over its standard deviation. What the noise of the
-    reference adds to the spread of the difference is taken out of it.
+    moves by its covariance with the difference, over its standard deviation, which is at most the
+    standard deviation of the difference. What the noise of the reference adds to the spread of the
+    difference is taken out of it.
 
     That a filter is too low is proved without knowing the law of the estimates: if the likelihood
     is at most a bound, the mean of unbiased estimates over that bound is at most 1, and a gambler
@@ -119,9 +124,11 @@ def check_filter(
     than three nats between draws, if a parameter is moved by more than half a standard deviation,
     or if the filter is lower elsewhere by three nats more than is usual between draws. An unbiased
     one is "off" if it is proved to be a nat too low. A filter passes if a difference of three nats
-    would have been seen. Where plain particles scatter by more than two nats over seeds the check
-    is undecided, unless guided ones prove the filter too low: they linearise, and may be wrong
-    where the other filter is. A model with ``score_from`` is compared on the rows that are scored.
+    would have been seen. Guided particles linearise as the filter does, but scatter over seeds
+    where that misleads them: they are trusted if they scatter by half a nat or less, plain ones up
+    to two nats. Otherwise the check is undecided, unless either prove the filter too low. A guided
+    filter itself is judged by plain ones. A model with ``score_from`` is compared on the rows that
+    are scored.
 
     References
     ----------

@@ -18,6 +18,7 @@ from ..filters.checks import check_system_and_filter
 from ..filters.outcomes import Failure
 from ..filters.protocol import Filter
 from ..ops.at_points import FilterAtPoints
+from ..ops.base import kernel
 from ..ops.likelihood import LogLikelihood
 from ..ops.signatures import ONE_RECORD, PANEL
 from .at_points import GraphsAtPoints
@@ -80,6 +81,10 @@ class VariableAtPoints:
         """Steps of one evaluation, of all records."""
         op = LogLikelihood(self.system, self.filter, self._form)
         return op.n_steps([self._constant["theta"], self._constant["steps"]])
+
+    def is_compiled(self, filter: Filter) -> bool:
+        """Whether the loops of a filter need no compilation."""
+        return kernel(LogLikelihood(self.system, filter, self._form)).plan.is_compiled
 
     def failures(self) -> list[Failure]:
         """Why the filter of the variable has no likelihood at each point, or that it has one."""

@@ -48,6 +48,7 @@ def sample(
     initvals: Mapping[str, Any] | Sequence[Mapping[str, Any] | None] | None = None,
     random_seed: int | np.random.Generator | None = None,
     progressbar: bool | str = True,
+    check: bool = True,
     checkpoint: str | os.PathLike | None = None,
     comm: Any = None,
 ) -> DataTree | None:
@@ -97,6 +98,8 @@ def sample(
     random_seed : int or numpy.random.Generator, optional
     progressbar : bool or str
         As in ``pm.sample``. If it is False, nothing but warnings is logged.
+    check : bool
+        Whether filters are compared with unbiased ones at the end, as in `sample_dram`.
     checkpoint, comm
         As in `sample_dram`, which then is the sampler.
 
@@ -133,7 +136,7 @@ def sample(
     given = RunArguments(
         draws=draws, tune=tune, until_ess=until_ess, max_draws=max_draws, chains=chains,
         cores=cores, random_seed=random_seed, initvals=initvals, kernel=kernel,
-        progressbar=progressbar,
+        progressbar=progressbar, check=check,
     )  # fmt: skip
     return sample_named(
         "", given_model(model), given, sampler, continue_from=continue_from, checkpoint=checkpoint,

@@ -46,6 +46,7 @@ def sample_dram(
     progressbar: bool | str = True,
     discard_tuned_samples: bool = True,
     compute_convergence_checks: bool = True,
+    check: bool = True,
     checkpoint: str | os.PathLike | None = None,
     comm: Any = None,
 ) -> DataTree | None:
@@ -127,10 +128,11 @@ def sample_dram(
         ``warmup_sample_stats``.
     compute_convergence_checks : bool
         As in ``pm.sample``: whether R-hat and effective sample sizes are checked at the end, which
-        takes long for many draws. With it, filters that are not exact for their systems are
-        compared with unbiased ones, as by `check_filter`, in two seconds or a tenth of the time of
-        the run; not after fewer than 600 iterations. Warnings about single chains are given in any
-        case.
+        takes long for many draws. Warnings about single chains are given in any case.
+    check : bool
+        Whether filters that are not exact for their systems are compared with unbiased ones at the
+        end, as by `check_filter`, in a second or a tenth of the time of the run; not after fewer
+        than 600 iterations, or without ``compute_convergence_checks``.
     checkpoint : str or path, optional
         A folder in which the chains are stored every few seconds. If the process ends for any
         reason, the same call resumes the run and returns bitwise the same draws as an uninterrupted
@@ -195,7 +197,7 @@ def sample_dram(
         draws=draws, tune=tune, until_ess=until_ess, max_draws=max_draws, thin=thin,
         chains=chains, cores=cores, random_seed=random_seed, initvals=initvals, kernel=kernel,
         progressbar=progressbar, discard_tuned_samples=discard_tuned_samples,
-        compute_convergence_checks=compute_convergence_checks,
+        compute_convergence_checks=compute_convergence_checks, check=check,
     )  # fmt: skip
     request = given.request()
     if pilot is not None:

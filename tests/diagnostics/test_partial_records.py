@@ -11,7 +11,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.checks.filters.budget import Budget
-from pymc_statespace_filters.checks.filters.estimates import unbiased_witnesses
+from pymc_statespace_filters.checks.filters.estimates import witnesses
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.pymc_model.filter_estimates import VariableAtPoints
 
@@ -59,8 +59,8 @@ def test_a_part_of_a_record_is_refused_with_filters_that_take_it():
 
 def test_a_guided_filter_is_no_witness_of_a_part_of_a_record():
     bent = system(bend=-1e-4)
-    for score_from, witnesses in ((2, 0), (0, 1)):
+    for score_from, n_guided in ((2, 0), (0, 1)):
         model = model_with(psf.EKF(), bent, score_from=score_from)
         points = VariableAtPoints(model, "d", np.log(SLOPES.T))
-        found = unbiased_witnesses(points, psf.EKF(), Budget(5.0))
-        assert sum(isinstance(one, psf.GuidedPF) for one in found) == witnesses
+        found = witnesses(points, psf.EKF(), Budget(5.0))
+        assert sum(isinstance(one, psf.GuidedPF) for one in found) == n_guided

@@ -2,13 +2,17 @@
 
 import json
 import logging
+import warnings
 
 import numpy as np
 import pymc as pm
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.pymc_model.filter_estimates import VariableAtPoints
 from tests.systems import autoregression
+
+pytestmark = pytest.mark.usefixtures("without_compilation")
 
 N = 30
 SETTINGS = {"draws": 300, "tune": 300, "chains": 2, "random_seed": 1, "cores": 1}
@@ -75,11 +79,40 @@ def test_several_models_are_named():
     }
 
 
-@pytest.mark.parametrize("changes", [{"compute_convergence_checks": False}, {"draws": 290}])
+@pytest.mark.parametrize(
+    "changes", [{"check": False}, {"compute_convergence_checks": False}, {"draws": 290}]
+)
 def test_it_is_left_out_on_demand_and_after_short_runs(changes):
     settings = SETTINGS | changes
     idata = psf.sample_dram(model=model_of(1.0), progressbar=False, **settings)
     assert "filter_check" not in idata.attrs
+
+
+def test_sample_and_run_models_leave_it_out_on_demand(caplog):
+    trees = {}
+    for check in (False, True):
+        given = SETTINGS | {"until_ess": None, "check": check, "progressbar": False}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore" if check else "error", psf.errors.FilterWarning)
+            trees |= {("sample", check): psf.sample(model=model_of(1.0), **given)}
+            trees |= {("run", check): psf.run_models({"m": model_of(1.0)}, **given)["m"]}
+    assert all(("filter_check" in tree.attrs) == check for (_, check), tree in trees.items())
+
+
+def test_check_is_a_flag():
+    with pytest.raises(psf.errors.ModelError, match="check must be True or False, got 1"):
+        psf.sample_dram(model=model_of(1.0), check=1)
+
+
+def test_the_report_names_the_call_that_takes_the_time_to_compile(caplog, monkeypatch):
+    monkeypatch.setattr(VariableAtPoints, "is_compiled", lambda variable, filter: False)
+    model = model_of(1.0)
+    with caplog.at_level(logging.DEBUG, "pymc.stats.convergence"):
+        idata = psf.sample_dram(model=model, progressbar=False, **SETTINGS)
+    assert outcome_of(idata) == "undecided"
+    assert "is not compiled yet; psf.check_filter(idata, model) takes" in caplog.text
+    found = psf.check_filter(idata, model, random_seed=1, progressbar=False)
+    assert found["outcome"][0] == "off"
 
 
 def test_a_model_without_such_a_variable_has_none():

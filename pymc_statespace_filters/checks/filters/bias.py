@@ -2,8 +2,7 @@
 
 Three findings. A shortfall is proved as in `low`, by unbiased estimates at any tails. The mean
 difference, which moves the evidence, and its covariance with the parameters, which moves them, need
-a reference that is close to the likelihood: an exact filter, or plain particles that scatter
-little. Guided particles alone are none, as they may go astray where the filter does.
+a reference that is close to the likelihood: an exact filter, or particles that scatter little.
 """
 
 from collections.abc import Sequence
@@ -13,19 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, stdtrit
 
+from ...filters.protocol import Filter
 from ...filters.written import short_form
 from .estimates import Comparison, Estimates
 from .finding import ALPHA, FINE, OFF, TOLERATED, UNDECIDED, VISIBLE, Finding, cure, nats
 from .low import shortfall, without_likelihood
-from .points import Points
 
 Array = NDArray[np.float64]
 
-# Posterior standard deviations by which a parameter may be moved.
-_TOLERATED_SHIFT = 0.5
-_FEWEST = 4  # points of one spread, from which a covariance is taken
+# Posterior standard deviations by which a parameter may be moved, and by which it would have been
+# seen to be moved when no more draws are compared.
+_TOLERATED_SHIFT, _SEEN_SHIFT = 0.5, 1.0
+_FEWEST = 4  # draws, from which a covariance is taken
 # Nats above the errors by which guided particles must exceed plain ones to be preferred to them.
 _HIGHER = 0.3
+_QUIET = 0.5  # nats by which guided particles scatter at most, whose mean is trusted without others
 _N_ERRORS = 3.0
 
 
@@ -51,71 +52,95 @@ class _Difference(NamedTuple):
         dof = max(self.n - 1, 1)
         return float(self.spread * np.sqrt(dof / chdtri(dof, ALPHA)))
 
+    @property
+    def most_spread(self) -> float:
+        """The upper end, with the noise: no parameter is moved by more standard deviations."""
+        dof = max(self.n - 1, 1)
+        return float(self.se * np.sqrt(self.n * dof / chdtri(dof, 1.0 - ALPHA)))
 
-def bias_at_draws(found: Comparison, points: Points, names: Sequence[str]) -> list[Finding]:
-    """Compare an approximate filter with the likelihood at the points, of which some are draws."""
-    draws = found.at(points.spread == 1.0)
-    if (lost := without_likelihood(draws, "bias", "at draws")) is not None:
+
+def not_compared(filter: Filter, reason: str) -> Finding:
+    """That there was no witness, and why."""
+    verdict = f"undecided whether {short_form(filter)} is off: {reason}"
+    return Finding("bias", np.nan, np.nan, ALPHA, np.inf, UNDECIDED, verdict)
+
+
+def bias_at_draws(found: Comparison, x: Array, names: Sequence[str]) -> list[Finding]:
+    """Compare an approximate filter with the likelihood at draws.
+
+    ``x`` (m, k) are the draws in standard deviations, and ``names`` those of their elements.
+    """
+    if (lost := without_likelihood(found, "bias", "at draws")) is not None:
         return [lost]
-    name, reference = short_form(found.checked.filter), reference_of(draws)
+    name, reference = short_form(found.checked.filter), reference_of(found)
     if reference is None:
-        return [_without_reference(draws, name)]
-    bias = _difference(draws.checked, reference)
+        return [_without_reference(found, name)]
+    bias, other = _difference(found.checked, reference), short_form(reference.filter)
     if bias.n < 2:
-        verdict = f"undecided whether {name} is off: {short_form(reference.filter)} fails at draws"
-        return [Finding("bias", np.nan, np.nan, ALPHA, np.inf, UNDECIDED, verdict)]
-    moved = _shifts(found, points, names, reference)
+        return [not_compared(found.checked.filter, f"{other} fails at draws")]
+    moved = _shifts(reference.mean - found.checked.mean, x, names, bias)
     visible = abs(bias.mean) + bias.margin
     size = f"{nats(abs(bias.mean))} ± {nats(bias.se)} nats"
-    side, other = "below" if bias.mean < 0.0 else "above", short_form(reference.filter)
+    side = "below" if bias.mean < 0.0 else "above"
     what = f"{name} is {size} {side} {other} at draws"
-    worst = max(moved, key=lambda one: abs(one.statistic), default=None)
-    moves = "" if worst is None else f"; {worst.verdict}"
-    is_moved = any(one.outcome == OFF for one in moved)
+    most = max((one.visible for one in moved), default=bias.most_spread)
+    moves = f"no parameter would move by more than {max(most, 0.1):.1f} sd"
+    worst = max(moved, key=lambda one: abs(one.statistic) * (one.outcome == OFF), default=None)
+    is_moved = worst is not None and worst.outcome == OFF
     if abs(bias.mean) - bias.margin > TOLERATED or is_moved or bias.least_spread > VISIBLE:
         outcome = OFF
+        moves = f"; {worst.verdict}" if worst is not None and is_moved else ""
         verdict = (
             f"{what}, by which the log-evidence is off, and this varies by {nats(bias.spread)} "
-            f"between draws{moves}. {cure(draws)}"
+            f"between draws{moves}. {cure(found)}"
         )
-    elif any(one.outcome == UNDECIDED for one in moved):
-        outcome = UNDECIDED
-        verdict = f"undecided whether {name} is off: {what}{moves}, which is too uncertain to tell"
-    elif visible <= VISIBLE:
+    elif visible <= VISIBLE and most <= VISIBLE:
         outcome = FINE
         verdict = (
-            f"{name} is close to {other}: {size} {side} it at draws{moves} (a warning begins where "
-            f"more than {TOLERATED:g} nat or {_TOLERATED_SHIFT:g} sd are certain)"
+            f"{name} is close to {other}: {size} {side} it at draws; {moves} if the filter were "
+            f"exact (a warning begins where more than {TOLERATED:g} nat or {_TOLERATED_SHIFT:g} sd "
+            "are certain)"
         )
     else:
         outcome = UNDECIDED
-        verdict = f"undecided whether {name} is off: {what}, too uncertain to exclude {VISIBLE:g}"
+        verdict = (
+            f"undecided whether {name} is off: {what}, and {moves}, which is too uncertain to tell"
+        )
     bias_row = Finding("bias", bias.mean, bias.se, ALPHA, visible, outcome, verdict)
     return [bias_row, *moved]
 
 
-def bias_elsewhere(found: Comparison, draws: Comparison) -> Finding | None:
+def is_settled(findings: Sequence[Finding]) -> bool:
+    """Whether more draws would tell no more than these findings about them."""
+    first, *shifts = findings
+    is_seen = first.visible <= VISIBLE and all(one.visible <= _SEEN_SHIFT for one in shifts)
+    return first.outcome == OFF or not shifts or is_seen
+
+
+def bias_elsewhere(found: Comparison, draws: Comparison) -> list[Finding]:
     """Test whether the filter is lower at other points than at draws, whose chain avoids them.
 
-    Lower by more than what is usual between draws. None if that is not known.
+    Lower by more than what is usual between draws. Nothing if that is not known.
     """
     lost = without_likelihood(found, "bias elsewhere", "at points as likely as its draws")
     if lost is not None:
-        return lost
+        return [lost]
     reference = reference_of(draws)
     if reference is None:
-        return None
+        return []
     name = short_form(found.checked.filter)
     usual = _difference(draws.checked, reference)
     proved = shortfall(found, found.checked.mean - usual.mean) - _N_ERRORS * usual.se
-    if not proved > VISIBLE + _N_ERRORS * usual.spread:
-        verdict = f"no sign that {name} keeps the chain away from other points"
-        return Finding("bias elsewhere", proved, np.nan, ALPHA, np.nan, FINE, verdict)
-    verdict = (
-        f"{name} keeps the chain away from points that are as likely as its draws: there it is "
-        f"{nats(proved)} nats lower at least, against the likelihood, than at draws. {cure(found)}"
-    )
-    return Finding("bias elsewhere", proved, np.nan, ALPHA, np.nan, OFF, verdict)
+    if proved > VISIBLE + _N_ERRORS * usual.spread:
+        outcome = OFF
+        verdict = (
+            f"{name} keeps the chain away from points that are as likely as its draws: there it is "
+            f"{nats(proved)} nats lower at least, against the likelihood, than at draws. "
+            f"{cure(found)}"
+        )
+    else:
+        outcome, verdict = FINE, f"no sign that {name} keeps the chain away from other points"
+    return [Finding("bias elsewhere", proved, np.nan, ALPHA, np.nan, outcome, verdict)]
 
 
 def reference_of(found: Comparison) -> Estimates | None:
@@ -126,19 +151,19 @@ def reference_of(found: Comparison) -> Estimates | None:
     """
     if found.exact is not None:
         return found.exact
-    plain = found.plain
+    plain, guided = found.plain, found.guided
     if plain is None or not plain.is_usable:
-        return None
-    for guided in found.guided:
-        gap = guided.mean - plain.mean
-        gap = gap[np.isfinite(gap)]
-        if not guided.is_usable or gap.size < 2:
-            continue
-        spread = float(gap.std(ddof=1) / np.sqrt(gap.size))
-        if abs(gap.mean()) <= 3.0 * spread + _HIGHER:
-            return min(plain, guided, key=lambda one: one.typical_error)
-        return guided if gap.mean() > 0.0 else plain
-    return plain
+        return guided if guided is not None and guided.scatter <= _QUIET else None
+    if guided is None or not guided.is_usable:
+        return plain
+    gap = guided.mean - plain.mean
+    gap = gap[np.isfinite(gap)]
+    if gap.size < 2:
+        return plain
+    spread = float(gap.std(ddof=1) / np.sqrt(gap.size))
+    if abs(gap.mean()) <= 3.0 * spread + _HIGHER:
+        return min(plain, guided, key=lambda one: one.typical_error)
+    return guided if gap.mean() > 0.0 else plain
 
 
 def _without_reference(draws: Comparison, name: str) -> Finding:
@@ -149,23 +174,10 @@ def _without_reference(draws: Comparison, name: str) -> Finding:
             f"log-evidence. {cure(draws)}"
         )
         return Finding("bias", -proved, np.nan, ALPHA, np.nan, OFF, verdict)
-    return Finding("bias", np.nan, np.nan, ALPHA, np.inf, UNDECIDED, _undecided(draws, name))
-
-
-def _undecided(draws: Comparison, name: str) -> str:
-    text = f"undecided whether {name} is off: no filter without a guide takes this system"
-    if draws.plain is not None:
-        text = (
-            f"undecided whether {name} is off: plain particles, {short_form(draws.plain.filter)}, "
-            f"scatter by {nats(draws.plain.scatter)} nats"
-        )
-    for one in draws.guided:
-        gap = float(np.median(draws.checked.mean - one.mean))
-        text += (
-            f"; {short_form(one.filter)} is {nats(abs(gap))} nats "
-            f"{'above' if gap < 0.0 else 'below'} {name}, but may go astray where that does"
-        )
-    return text
+    scatters = [
+        f"{short_form(one.filter)} scatters by {nats(one.scatter)} nats" for one in draws.unbiased
+    ]
+    return not_compared(draws.checked.filter, " and ".join(scatters))
 
 
 def _difference(checked: Estimates, reference: Estimates) -> _Difference:
@@ -180,49 +192,30 @@ def _difference(checked: Estimates, reference: Estimates) -> _Difference:
     return _Difference(n, float(values[known].mean()), np.sqrt(max(variance, noise) / n), spread)
 
 
-def _shifts(
-    found: Comparison, points: Points, names: Sequence[str], at_draws: Estimates
-) -> list[Finding]:
-    """By how many posterior standard deviations the difference moves each parameter.
+def _shifts(lost: Array, x: Array, names: Sequence[str], bias: _Difference) -> list[Finding]:
+    """By how many posterior standard deviations what the filter lacks moves each parameter.
 
-    To first order, its covariance with the difference over its standard deviation. At points spread
-    out by a factor it is larger by the square of that factor.
+    To first order, its covariance with the parameter over the parameter's standard deviation: at
+    most its own standard deviation.
     """
-    kind = type(at_draws.filter)
-    witnesses = [one for one in (found.exact, found.plain, *found.guided) if one is not None]
-    reference = next(one for one in witnesses if type(one.filter) is kind)
-    lost = reference.mean - found.checked.mean
-    products = np.concatenate(
-        [
-            _products(points.z[rows], lost[rows], spread)
-            for spread in np.unique(points.spread[points.spread > 0.0])
-            for rows in [(points.spread == spread) & np.isfinite(lost)]
-        ]
-    )
-    if len(products) < _FEWEST:
+    known = np.isfinite(lost)
+    x, lost, n = x[known], lost[known], int(known.sum())
+    if n < _FEWEST:
         return []
-    shifts = products.mean(axis=0)
-    errors = products.std(axis=0, ddof=1) / np.sqrt(len(products))
-    margin = stdtrit(len(products) - 1, 1.0 - ALPHA / (2.0 * len(names)))
+    products = (x - x.mean(axis=0)) * (lost - lost.mean())[:, None] * n / (n - 1)
+    margin = stdtrit(n - 1, 1.0 - ALPHA / (2.0 * len(names)))
+    ends = products.mean(axis=0), products.std(axis=0, ddof=1) / np.sqrt(n)
     return [
-        _shift(name, float(shift), float(se), float(margin * se))
-        for name, shift, se in zip(names, shifts, errors, strict=True)
+        _shift(name, float(shift), float(se), float(margin * se), bias.most_spread)
+        for name, shift, se in zip(names, *ends, strict=True)
     ]
 
 
-def _products(z: Array, lost: Array, spread: float) -> Array:
-    """Terms (n, k) whose mean is the covariance, scaled to the spread of draws; none of too few."""
-    n = len(lost)
-    if n < _FEWEST:
-        return z[:0]
-    centred = (z - z.mean(axis=0)) * (lost - lost.mean())[:, None]
-    return centred * n / (n - 1) / spread**2
-
-
-def _shift(name: str, shift: float, se: float, margin: float) -> Finding:
-    outcome = OFF if abs(shift) - margin > _TOLERATED_SHIFT else FINE
-    if outcome == FINE and abs(shift) + margin > VISIBLE:
-        outcome = UNDECIDED
-    moved = f"would move by {shift:+.1f} ± {se:.1f} sd if the filter were exact"
-    verdict = f"the posterior of {name} {moved}"
-    return Finding(f"shift of {name}", shift, se, ALPHA, abs(shift) + margin, outcome, verdict)
+def _shift(name: str, shift: float, se: float, margin: float, most: float) -> Finding:
+    visible = min(abs(shift) + margin, most)
+    outcome = UNDECIDED if visible > VISIBLE else FINE
+    moved = f"would move by less than {max(visible, 0.1):.1f} sd"
+    if abs(shift) - margin > _TOLERATED_SHIFT:
+        outcome, moved = OFF, f"would move by {shift:+.1f} ± {se:.1f} sd"
+    verdict = f"the posterior of {name} {moved} if the filter were exact"
+    return Finding(f"shift of {name}", shift, se, ALPHA, visible, outcome, verdict)

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,12 +24,12 @@ from ...pymc_model.elements import element_names
 from ...pymc_model.filter_estimates import VariableAtPoints
 from ...pymc_model.inspection import log_density_terms, state_space_nodes
 from ...pymc_model.posterior_draws import posterior_group, unconstrained_draws
-from .bias import bias_at_draws, bias_elsewhere
+from .bias import bias_at_draws, bias_elsewhere, is_settled, not_compared
 from .budget import Budget
-from .estimates import Comparison, compare, is_unbiased
+from .estimates import Comparison, compare, is_unbiased, witnesses
 from .finding import EXACT, FINE, OFF, UNDECIDED, Finding
 from .low import low_at
-from .points import Points, choose_points
+from .points import points_elsewhere
 
 Array = NDArray[np.float64]
 
@@ -39,9 +40,10 @@ _ORDER = (OFF, UNDECIDED, FINE, EXACT)
 # Nats by which a point may be less likely than the draws, beside the volume where it lies.
 _SLACK = 3.0
 _MOST_DRAWS = 500  # of each chain, from which mean and spread are taken
-# Of the check at the end of a calculation: points, and CPU seconds for them, or the share of those
-# of the calculation if that is more.
-N_POINTS, LEAST_SECONDS, _SHARE = 20, 2.0, 0.1
+_GROWTH, _MOST_COMPARED = 4, 160  # draws, times as many until they are enough, and at most
+# Of the check at the end of a calculation: points, and CPU seconds with the compilation of a
+# witness, or the share of those of the calculation if that is more.
+N_POINTS, LEAST_SECONDS, _SHARE = 20, 1.0, 0.1
 # Points for a filter that corrects draws: it may be too low at few of them.
 MORE_POINTS = 40
 
@@ -76,11 +78,13 @@ def check_model(
     seconds: float,
     rng: np.random.Generator,
     progressbar: bool = False,
+    counts_compilation: bool = False,
 ) -> pd.DataFrame:
     """Check the filters of all observed StateSpace variables, at draws of the posterior.
 
     They are those of a result, or draws (n, k) of the unconstrained space. ``filter`` is checked in
-    their place; None: their own. ``seconds`` of CPU time are for all variables together.
+    their place; None: their own. ``seconds`` of CPU time are for all variables together, with or
+    without the compilation of other filters.
     """
     nodes = state_space_nodes(model)
     chosen = {
@@ -97,7 +101,7 @@ def check_model(
     rows = []
     for name, one in chosen.items():
         if name in checked:
-            budget = Budget(seconds / len(checked))
+            budget = Budget(seconds / len(checked), counts_compilation=counts_compilation)
             with row_progress(budget, enabled=progressbar) as begin, np.errstate(invalid="ignore"):
                 begin(f"check of {short_form(one)} of {name}", n_points)
                 # Invalid is minus infinity minus itself: failures.
@@ -118,7 +122,15 @@ def check_at_end(
 ) -> dict[str, dict[str, str]]:
     """The outcomes for all variables, at the end of a calculation that took so many CPU seconds."""
     seconds = max(LEAST_SECONDS * n_points / N_POINTS, _SHARE * seconds)
-    found = check_model(draws, model, filter=filter, n_points=n_points, seconds=seconds, rng=rng)
+    found = check_model(
+        draws,
+        model,
+        filter=filter,
+        n_points=n_points,
+        seconds=seconds,
+        rng=rng,
+        counts_compilation=True,
+    )
     return outcomes_of(found)
 
 
@@ -140,32 +152,63 @@ def _check_variable(
     budget: Budget,
     rng: np.random.Generator,
 ) -> list[Finding]:
-    points = choose_points(model, draws, n_points, rng)
-    found = compare(VariableAtPoints(model, name, points.x), filter, budget, rng)
-    points = Points(*(part[: len(found.checked.logs)] for part in points))
-    at_draws = found.at(points.spread == 1.0)
-    others = found.at(_is_relevant(model, name, points, found))
-    if is_unbiased(filter):
-        findings = [low_at(at_draws, "at draws")]
-        return [*findings, low_at(others, "elsewhere")] if len(others.checked.logs) else findings
-    findings = bias_at_draws(found, points, element_names(model))
-    if len(others.checked.logs):
-        elsewhere = bias_elsewhere(others, at_draws)
-        findings += [elsewhere] if elsewhere is not None else []
-    return findings
+    n_elsewhere = n_points // 2
+    x = draws[rng.permutation(len(draws))[:_MOST_COMPARED]]
+    n_draws = min(n_points - n_elsewhere, len(x))
+    variable = VariableAtPoints(model, name, x[:n_draws])
+    scored, names = not is_unbiased(filter), element_names(model)
+    evaluate = partial(compare, budget=budget, rng=rng, scored=scored)
+
+    def judged(found: Comparison) -> list[Finding]:
+        if not scored:
+            return [low_at(found, "at draws")]
+        n, sd = len(found.checked.logs), draws.std(axis=0)
+        return bias_at_draws(found, x[:n] / np.where(sd > 0.0, sd, 1.0), names)
+
+    found: Comparison | None = None
+    reason = "not compiled yet" if budget.counts_compilation else "not known for this system"
+    findings = [not_compared(filter, f"a filter to compare it with is {reason}")]
+    for witness in witnesses(variable, filter, budget):
+        if found is None:
+            found = evaluate(variable, [filter, witness])
+        else:
+            found = found.with_witness(evaluate(variable, [witness]).checked)
+        findings = judged(found)
+        if findings[0].outcome != UNDECIDED or budget.is_spent:
+            break
+    if found is None:
+        return findings
+    filters = [filter, *(one.filter for one in found.witnesses)]
+    is_low: list[Finding] = []
+    if not budget.is_spent:
+        points, factors = points_elsewhere(model, draws, n_elsewhere, rng)
+        others = evaluate(variable.moved_to(points), filters)
+        others = others.at(_is_relevant(model, name, found, x, others, points, factors))
+        if len(others.checked.logs):
+            is_low = bias_elsewhere(others, found) if scored else [low_at(others, "elsewhere")]
+    while n_draws < len(x) and not (is_settled(findings) or budget.is_spent):
+        more = x[n_draws : _GROWTH * n_draws]
+        found = found.joined(evaluate(variable.moved_to(more), filters))
+        findings, n_draws = judged(found), n_draws + len(more)
+    return [*findings, *is_low]
 
 
 def _is_relevant(
-    model: pm.Model, name: str, points: Points, found: Comparison
+    model: pm.Model,
+    name: str,
+    at_draws: Comparison,
+    x: Array,
+    elsewhere: Comparison,
+    points: Array,
+    factors: Array,
 ) -> NDArray[np.bool_]:
-    """Which other points the posterior would hold, by the highest of all estimates there."""
-    highest = np.maximum(found.checked.mean, found.of_witnesses)
-    density = highest + _density_of_others(model, name, points.x)
-    factor = np.where(points.spread == 0.0, points.spread.max(), points.spread)
-    allowed = _SLACK + points.x.shape[1] * np.log(factor)
-    is_draw = points.spread == 1.0
-    lowest = density[is_draw & np.isfinite(density)].min(initial=np.inf)
-    return ~is_draw & (density >= lowest - allowed)
+    """Which points the posterior would hold, by the highest of all estimates there."""
+    highest = np.concatenate([at_draws.highest, elsewhere.highest])
+    n, m = len(at_draws.highest), len(elsewhere.highest)
+    density = highest + _density_of_others(model, name, np.concatenate([x[:n], points[:m]]))
+    allowed = _SLACK + x.shape[1] * np.log(factors[:m])
+    lowest = density[:n][np.isfinite(density[:n])].min(initial=np.inf)
+    return density[n:] >= lowest - allowed
 
 
 def _density_of_others(model: pm.Model, name: str, x: Array) -> Array:

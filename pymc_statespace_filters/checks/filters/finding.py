@@ -50,16 +50,15 @@ def cure(found: Comparison) -> str:
     plain = found.plain if found.plain is not None and found.plain.is_usable else None
     if found.exact is not None and plain is None:
         return f"Use {short_form(found.exact.filter)}, which computes this likelihood."
-    is_enough = None if plain is None else _enough(plain)
-    for one in found.guided:
-        agrees = plain is None or abs(np.median(one.mean - plain.mean)) <= TOLERATED
-        is_cheap = is_enough is None or _size(is_enough) > _AS_CHEAP * _size(one.filter)
-        of_guided = isinstance(found.checked.filter, GuidedPF)
-        if not of_guided and one.is_usable and agrees and is_cheap:
+    is_enough, guided = None if plain is None else _enough(plain), found.guided
+    is_of_other_kind = guided is not None and not isinstance(found.checked.filter, GuidedPF)
+    if guided is not None and is_of_other_kind and guided.is_usable:
+        agrees = plain is None or abs(np.median(guided.mean - plain.mean)) <= TOLERATED
+        if agrees and (is_enough is None or _size(is_enough) > _AS_CHEAP * _size(guided.filter)):
             others = "" if plain is None else " and agree with those of plain particles"
             return (
-                f"Use {short_form(one.filter)}: its estimates are unbiased, scatter by "
-                f"{nats(one.scatter)} nats here{others}."
+                f"Use {short_form(guided.filter)}: its estimates are unbiased, scatter by "
+                f"{nats(guided.scatter)} nats here{others}."
             )
     if is_enough is not None:
         return f"Use {short_form(is_enough)}, whose estimates are unbiased."

@@ -9,6 +9,7 @@ Arguments of an entry point are numbers and addresses of contiguous float64 or i
 """
 
 import gc
+import os
 from collections import namedtuple
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -188,6 +189,13 @@ class EntryPoint:
                 raise
         llvm.add_symbol(self.symbol, compiled.address)
         _compiled[self.symbol] = compiled
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether it was compiled before, in this process or on disk."""
+        if self.symbol in _compiled or self.key is None or not config.numba__cache:
+            return self.symbol in _compiled
+        return os.path.exists(_cache(self._function, self.key)._cache_file._index_path)
 
     @property
     def address(self) -> int:

@@ -321,6 +321,11 @@ class Plan:
         llvm.add_symbol(self._symbol, words.ctypes.data)
         return words.ctypes.data
 
+    @property
+    def is_compiled(self) -> bool:
+        """Whether the function to call, which knows nothing of a system, needs no compilation."""
+        return self._functions[HEADER.run].is_compiled
+
     def load(self) -> None:
         """Compile the functions, or load them from disk, and define the symbol."""
         _ = self.address

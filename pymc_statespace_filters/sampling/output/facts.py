@@ -9,7 +9,7 @@ from xarray import DataTree
 
 from ...facts import Fact
 from ...statistics.lower_chains import LowerChain
-from ..run.request import SamplingRequest
+from ..run.request import ExecutionOptions, SamplingRequest
 from ..run.stopping import Length
 from ..starts.modes import Points
 from ..target.record_target import RecordTarget
@@ -103,10 +103,8 @@ class EndedRun(ChainFact):
         For the search of missed parts and the check of filters.
     is_complete : bool
         Whether all chains have made as many iterations as they were to.
-    is_checked : bool
-        Whether the posterior and its filters are to be checked.
-    level : str
-        Of the report.
+    options : ExecutionOptions
+        Which checks were asked for, and the level of the report.
     goes_on : bool
         Whether `sample(continue_from=)` takes the draws.
     """
@@ -123,8 +121,7 @@ class EndedRun(ChainFact):
     positions: np.ndarray
     rngs: tuple[np.random.Generator, np.random.Generator]
     is_complete: bool
-    is_checked: bool
-    level: str
+    options: ExecutionOptions
 
 
 @dataclass(frozen=True)

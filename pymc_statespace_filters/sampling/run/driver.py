@@ -113,9 +113,6 @@ def _run(
     def trees() -> dict[str, DataTree] | None:
         if comm.rank > 0:
             return None
-        check = options.compute_convergence_checks
-        # Who wants no progress bar wants no report on the screen either.
-        level = "info" if options.progressbar else "debug"
         # After an interruption a model may have no draws: the others have theirs.
         kept = [task for task in tasks if task.has_draws]
         if not kept and not all(task.is_complete for task in tasks):
@@ -125,12 +122,7 @@ def _run(
             if task not in kept:
                 tell(WithoutDraws(task.name))
         with COMPILATION:
-            return {
-                task.name: task.to_datatree(
-                    options.told, check_convergence=check, report_level=level
-                )
-                for task in kept
-            }
+            return {task.name: task.to_datatree(options) for task in kept}
 
     return comm.run_collectively(trees) if options.ranks.gather == "all" else trees()
 

@@ -1,6 +1,5 @@
 """What the chains of a model have found: the DataTree, and the facts about the run."""
 
-from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +23,7 @@ from .record_chain import chain_of
 
 if TYPE_CHECKING:
     from .model_task import ModelTask
+    from .request import ExecutionOptions
 
 type Results = list[tuple[Draws, ChainState]]  # of each chain
 
@@ -34,16 +34,14 @@ def tree_of(
     task: "ModelTask",
     results: Results,
     convergence: Convergence | None,
-    told: Callable[..., Any],
+    options: "ExecutionOptions",
     *,
     is_complete: bool,
-    check_convergence: bool,
-    report_level: str,
 ) -> DataTree:
     """Make the DataTree of all chains; the results are emptied.
 
-    ``convergence`` are the diagnostics, if they were asked for; ``told`` is called with the fact
-    that the chains have ended.
+    ``convergence`` are the diagnostics, if they were asked for; ``options.told`` is called with
+    the fact that the chains have ended.
     """
     target, request = task.prepare(), task.request
     of_results = _facts(task, results)
@@ -84,12 +82,11 @@ def tree_of(
         seconds=task.seconds,
         convergence=convergence,
         rngs=(side_generator(key, 3), side_generator(key, 2)),
-        is_checked=check_convergence,
-        level=report_level,
+        options=options,
         is_complete=is_complete,
         **of_results,
     )
-    told(ended, of_model(task.name))
+    options.told(ended, of_model(task.name))
     return tree
 
 

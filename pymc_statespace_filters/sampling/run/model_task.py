@@ -1,9 +1,8 @@
 """All chains of one model: their starts, how long they go on, and their results."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cached_property, partial
-from typing import Any
 
 import numpy as np
 from pymc.model import Model
@@ -30,7 +29,7 @@ from .population_search import (
     search_population,
     stops_of,
 )
-from .request import SamplingRequest
+from .request import ExecutionOptions, SamplingRequest
 from .stopping import Length, first_length, next_length
 from .thinned_draws import Thinning
 
@@ -302,24 +301,20 @@ class ModelTask:
         n_skipped = self.request.n_skipped
         return any(len(draws.positions) > n_skipped for draws, _ in self._results.values())
 
-    def to_datatree(
-        self, told: Callable[..., Any], *, check_convergence: bool, report_level: str
-    ) -> DataTree:
-        """Make the DataTree of all chains; ``told`` is called with the fact that they have ended.
+    def to_datatree(self, options: ExecutionOptions) -> DataTree:
+        """Make the DataTree of all chains; ``options.told`` is called with the fact of their end.
 
         The task keeps no results: the draws are in memory twice, but never three times.
         """
         request, found, is_complete = self.request, None, self.is_complete
-        if check_convergence or request.until_ess is not None:
+        if options.compute_convergence_checks or request.until_ess is not None:
             found = unless_interrupted(self.convergence, None)
         return tree_of(
             self,
             [self._results.pop(index) for index in range(request.chains)],
             found,
-            told,
+            options,
             is_complete=is_complete,
-            check_convergence=check_convergence,
-            report_level=report_level,
         )
 
 

@@ -114,8 +114,14 @@ class ExecutionOptions(NamedTuple):
     cores: int | None
     progressbar: bool | str
     compute_convergence_checks: bool
+    checks_filters: bool
     ranks: Ranks
     told: Callable[..., Any] = tell  # what becomes of the fact that a run has ended
+
+    @property
+    def level(self) -> str:
+        """That of the report: who wants no progress bar wants none on the screen either."""
+        return "info" if self.progressbar else "debug"
 
     def check(self) -> None:
         """Raise a `ModelError` if an argument is not as ``sample_dram`` describes it."""
@@ -124,6 +130,7 @@ class ExecutionOptions(NamedTuple):
                 f"progressbar must be True, False or a bar of pm.sample, got {self.progressbar!r}"
             )
         check_flag("compute_convergence_checks", self.compute_convergence_checks)
+        check_flag("check", self.checks_filters)
         if self.cores is not None and (not is_integer(self.cores) or self.cores < 1):
             raise ModelError(f"cores must be None or an integer of at least 1, got {self.cores!r}")
 
@@ -145,11 +152,12 @@ class RunArguments:
     progressbar: bool | str = True
     discard_tuned_samples: bool = True
     compute_convergence_checks: bool = True
+    check: bool = True
 
     def options(self, comm: Any) -> ExecutionOptions:
         """How to execute the run, on the ranks of ``comm``."""
-        checks = self.compute_convergence_checks
-        return ExecutionOptions(self.cores, self.progressbar, checks, Ranks.of(comm))
+        checks = self.compute_convergence_checks, self.check
+        return ExecutionOptions(self.cores, self.progressbar, *checks, Ranks.of(comm))
 
     def request(self) -> SamplingRequest:
         """Check the arguments that need no model, and make a request of them.
