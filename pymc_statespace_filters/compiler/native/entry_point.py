@@ -9,7 +9,6 @@ Arguments of an entry point are numbers and addresses of contiguous float64 or i
 """
 
 import gc
-import os
 from collections import namedtuple
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -169,16 +168,7 @@ class EntryPoint:
             return
         for needed in self._needs:
             needed.compile()
-        options = {"nopython": True, "error_model": "numpy", "fastmath": FAST_MATH}
-        compiled: Any = CFunc(
-            self._function,
-            (self._arguments, self._returns),
-            {},
-            options,
-            pipeline_class=InternalLinkageCompiler,
-        )
-        if self.key is not None and config.numba__cache:
-            compiled._cache = _cache(self._function, self.key)
+        compiled = self._callback()
         # LLVM calls Python, where an interrupt would be lost.
         with held_interrupts(), slow_compilation(self._name), _no_garbage_collection():
             try:
@@ -190,12 +180,31 @@ class EntryPoint:
         llvm.add_symbol(self.symbol, compiled.address)
         _compiled[self.symbol] = compiled
 
+    def _callback(self) -> Any:
+        """Numba's object of the function, before it is compiled or loaded."""
+        options = {"nopython": True, "error_model": "numpy", "fastmath": FAST_MATH}
+        compiled: Any = CFunc(
+            self._function,
+            (self._arguments, self._returns),
+            {},
+            options,
+            pipeline_class=InternalLinkageCompiler,
+        )
+        if self.key is not None and config.numba__cache:
+            compiled._cache = _cache(self._function, self.key)
+        return compiled
+
     @property
     def is_compiled(self) -> bool:
-        """Whether it was compiled before, in this process or on disk."""
-        if self.symbol in _compiled or self.key is None or not config.numba__cache:
-            return self.symbol in _compiled
-        return os.path.exists(_cache(self._function, self.key)._cache_file._index_path)
+        """Whether it was compiled before: in this process, on disk, or with the package."""
+        if self.symbol in _compiled:
+            return True
+        for needed in self._needs:  # whose symbols it refers to when it is loaded
+            if not needed.is_compiled:
+                return False
+            needed.compile()
+        found = self._callback()
+        return bool(found._cache.load_overload(found._sig, found._targetdescr.target_context))
 
     @property
     def address(self) -> int:

@@ -39,6 +39,25 @@ def test_a_damaged_file_is_compiled_anew(ending):
     assert len(file.read_bytes()) > 0.9 * len(whole)  # for the next process
 
 
+def test_it_is_known_what_needs_no_compilation():
+    def made(needs=()):
+        inside = FunctionType(_nothing.__code__, {"__name__": entry_point.__name__}, "_nothing")
+        return EntryPoint(inside, {"n": types.intp}, "nothing", (uuid4().hex,), needs)
+
+    needed = made()
+    point = made([needed])
+    assert not needed.is_compiled
+    point.compile()
+    assert point.is_compiled
+    for one in (needed, point):
+        del entry_point._compiled[one.symbol]
+        assert one.is_compiled  # on disk
+    other = made()
+    entry_point._compiled.pop(point.symbol, None)
+    assert not made([other]).is_compiled
+    assert other.symbol not in entry_point._compiled
+
+
 def test_a_damaged_file_of_a_module_is_compiled_anew(tmp_path, monkeypatch):
     monkeypatch.setattr(machine_code, "NUMBA_CACHE_PATH", tmp_path)
     made = []
