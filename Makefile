@@ -88,7 +88,7 @@ linkcheck: $(VENV)/.installed  ## check the guide's links to other sites; needs 
 release-quick: $(VENV)/.installed  ## build wheel and sdist, and check their contents, size and metadata; takes seconds, needs git
 	$(IN)/python packaging/release_check.py --quick
 
-release-check:  ## build wheel and sdist into dist/, install them elsewhere and test them; takes six minutes, needs git and a registry
+release-check:  ## build wheel and sdist into dist/, install them elsewhere and test them; takes 15 minutes, needs git and a registry
 	@$(if $(PYTHON),,$(NO_PYTHON))
 	$(PYTHON) packaging/release_check.py
 

@@ -19,7 +19,6 @@ V2 = "cmov crc32 cx16 cx8 fxsr mmx popcnt sahf sse sse2 sse3 sse4.1 sse4.2 ssse3
 V3 = f"{V2} avx avx2 bmi bmi2 f16c fma lzcnt movbe xsave"
 V4 = f"{V3} avx512bw avx512cd avx512dq avx512f avx512vl"
 # By the names that LLVM has for the levels of the psABI; `shipped_code` takes the last that it can.
-_ON_LINUX = sys.platform == "linux"
 LEVELS = {f"x86-64-v{n}": [f"+{one}" for one in v.split()] for n, v in ((3, V3), (4, V4))}
 
 
@@ -36,8 +35,10 @@ def levels_of_this_processor() -> list[str]:
     """The levels whose code runs here; on Linux alone, where they are tested."""
     import llvmlite.binding as llvm
 
+    if sys.platform != "linux":
+        return []
     here = set(llvm.get_host_cpu_features().flatten().split(","))
-    return [n for n, features in LEVELS.items() if here.issuperset(features) and _ON_LINUX]
+    return [level for level, features in LEVELS.items() if here.issuperset(features)]
 
 
 def run_studies(level: str, cache: Path, *arguments: str | Path) -> str:

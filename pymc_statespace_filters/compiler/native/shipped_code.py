@@ -86,7 +86,7 @@ def shipped_for(host: tuple[str, str, str]) -> ShippedCode | None:
         try:
             manifest = json.loads(path.read_text(encoding="utf-8"))
             made_by, checksums = manifest["versions"], dict(manifest["checksums"])
-            triple, name, features = manifest["target"]
+            triple, name, features = map(str, manifest["target"])
         except (OSError, ValueError, TypeError, KeyError) as error:
             _LOG.debug("%s cannot be read: %s", path, error)
             continue

@@ -134,6 +134,13 @@ def test_a_damaged_manifest_is_as_none(wheel, text):
     assert wheel.is_compiled()
 
 
+@pytest.mark.parametrize("entry", ["versions", "target", "checksums"])
+@pytest.mark.parametrize("value", [None, [], [None] * 3])
+def test_a_manifest_of_other_entries_is_as_none(wheel, entry, value):
+    wheel.change(**{entry: value})
+    assert wheel.is_compiled()
+
+
 ROOT_OF_A_MATRIX = """
 import runpy, sys
 from ctypes import CFUNCTYPE, c_int64, c_void_p
