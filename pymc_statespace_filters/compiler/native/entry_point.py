@@ -8,10 +8,8 @@ therefore compiled once per installation, and a model once for all filters.
 Arguments of an entry point are numbers and addresses of contiguous float64 or int64 data.
 """
 
-import gc
 from collections import namedtuple
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from inspect import signature
 from typing import Any
 from uuid import uuid4
@@ -82,24 +80,12 @@ def cached_on_disk(function: Any, *parts: str | None) -> Any:
 
 def njit_cached(function: Callable) -> Any:
     """Compile a function of this package that Python calls; for the next process from disk."""
-    return cached_on_disk(njit(function, error_model="numpy", nogil=True))
+    return cached_on_disk(njit(function, error_model="numpy", nogil=True, no_cfunc_wrapper=True))
 
 
 def _cache(function: Callable, key: str) -> _CacheByKey:
     CACHED_SRC_FUNCTIONS[function] = key
     return _CacheByKey(function)
-
-
-@contextmanager
-def _no_garbage_collection() -> Iterator[None]:
-    """Collect no garbage meanwhile: a tenth of a compilation, whose objects nearly all stay."""
-    was_enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_enabled:
-            gc.enable()
 
 
 class EntryPoint:
@@ -170,7 +156,7 @@ class EntryPoint:
             needed.compile()
         compiled = self._callback()
         # LLVM calls Python, where an interrupt would be lost.
-        with held_interrupts(), slow_compilation(self._name), _no_garbage_collection():
+        with held_interrupts(), slow_compilation(self._name):
             try:
                 compiled.compile()
             except NumbaError as error:

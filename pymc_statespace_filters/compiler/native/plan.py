@@ -27,8 +27,10 @@ from numba import carray, types
 from .entry_point import I64_PTR, EntryPoint
 from .jit import njit_internal
 from .outcome_code import OutcomeCode
+from .slots import known_when_compiled
 
 
+@known_when_compiled
 class RecordSlots(NamedTuple):
     """Parameters (G, k), rows (J,) or (J, 3), data (J, p), inputs and starts, by address and size.
 
@@ -51,6 +53,7 @@ class RecordSlots(NamedTuple):
     n_starts: int = 13
 
 
+@known_when_compiled
 class RequestSlots(NamedTuple):
     """What belongs to one call."""
 
@@ -79,6 +82,7 @@ class RequestSlots(NamedTuple):
     n_before: int = 22  # states from which points go on, one each
 
 
+@known_when_compiled
 class ResultSlots(NamedTuple):
     """Sizes of the results, then their addresses."""
 
@@ -114,6 +118,7 @@ class ResultSlots(NamedTuple):
     state: int = 29
 
 
+@known_when_compiled
 class HeaderSlots(NamedTuple):
     """The head of every plan; nothing else of it is read unless this is right."""
 

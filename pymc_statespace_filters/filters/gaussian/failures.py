@@ -63,9 +63,10 @@ def failure_in_lane(machine, work, n_lanes, lane, states, force, t0, k, d, term)
 def _trials(d):
     """Zero for every component of d that was seen: each alone, then all."""
     p = d.size
-    trials = np.full((p + 1, p), np.nan)
+    trials = np.empty((p + 1, p))
     for i in range(p):
-        trials[i, i] = trials[p, i] = 0.0 * d[i]
+        for row in range(p + 1):
+            trials[row, i] = 0.0 * d[i] if row in (i, p) else np.nan
     return trials
 
 
@@ -82,6 +83,7 @@ def _failure(machine, s, term, taken):
             return COVARIANCE_NOT_POSITIVE
     if not machine.has_gaussian_observation:
         return OBSERVATION_UNDEFINED if np.isnan(term) else ZERO_DENSITY
-    if not taken[:-1].all():
-        return OBSERVATION_UNDEFINED
+    for is_taken in taken[:-1]:
+        if not is_taken:
+            return OBSERVATION_UNDEFINED
     return ZERO_DENSITY if taken[-1] else SINGULAR

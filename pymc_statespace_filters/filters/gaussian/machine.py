@@ -7,7 +7,7 @@ import numpy as np
 from ...compiler.codegen.arguments import LANES_AT_ONCE, LaneArguments
 from ...compiler.native.entry_point import call_address
 from ...compiler.native.jit import inline_always, njit_internal
-from ..plan import PLAN
+from ..plan import PLAN, reals_of
 
 STRETCH = 32  # steps; the states of all lanes fit into the processor's cache
 
@@ -84,7 +84,7 @@ def read_machine(plan):
     return Machine(
         n=n, size=size, n_theta=n_theta, n_inputs=plan[PLAN.n_inputs],
         n_noises=plan[PLAN.n_noises], p=p, width=width, n_rows=plan[PLAN.n_rows],
-        dt=plan.view(np.float64)[PLAN.dt],
+        dt=reals_of(plan)[PLAN.dt],
         has_gaussian_observation=plan[PLAN.has_gaussian_observation] != 0,
         rows=rows_of_vectors(n_theta, plan[PLAN.n_covariances], p, size, n),
         start=plan[PLAN.start], along=plan[PLAN.along], along_back=plan[PLAN.along_back],

@@ -9,7 +9,7 @@ from ...compiler.codegen.arguments import MemberArguments
 from ...compiler.native.entry_point import call_address
 from ...compiler.native.jit import inline_always, njit_internal
 from ..outcomes import INVALID_PROBABILITY, NONE
-from ..plan import NULL, PLAN, read_system, settings_of
+from ..plan import NULL, PLAN, read_system, reals_of, settings_of
 
 # Observations whose densities are computed at once have about so many numbers in all.
 _AT_ONCE = 256
@@ -127,7 +127,7 @@ def read_chain(plan, theta, inputs):
         first_move[i + 1] = max(first_move[i + 1], first_move[i])
     return Chain(
         failure=system.failure, n_states=K, p=plan[PLAN.p],
-        dt=plan.view(np.float64)[PLAN.dt], is_invariant=size[10] != 0,
+        dt=reals_of(plan)[PLAN.dt], is_invariant=size[10] != 0,
         n_at_once=n_at_once,
         X=settings[at[0] : at[1]].reshape((n, K)),
         origin=_whole(settings[at[1] :], M), successor=successor, first_move=first_move,

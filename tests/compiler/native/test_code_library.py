@@ -1,11 +1,15 @@
 """Closed libraries keep to themselves what other libraries might define otherwise."""
 
+import gc
 import math
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from llvmlite.binding import Linkage
 from numba import njit
+from numba.core.codegen import JITCodeLibrary
+from numba.core.runtime import _nrt_python, rtsys
 
 from pymc_statespace_filters.compiler.native import code_library
 from pymc_statespace_filters.compiler.native.code_library import with_internal_linkage
@@ -138,3 +142,65 @@ def test_a_function_is_optimised_once_however_many_call_it(monkeypatch):
     EntryPoint(evaluate, {"out": F64_PTR}, "evaluate_once").compile()
     assert optimised.count("_LinkedLibrary") == 3
     assert optimised.count("_InternalLinkageLibrary") == 1
+
+
+class Pair(NamedTuple):
+    first: np.ndarray
+    second: np.ndarray
+
+
+def exchanged(pair):
+    turned = Pair(pair.second, pair.first.copy())
+    return Pair(turned.second, turned.first)
+
+
+@pytest.fixture
+def counted_memory():
+    _nrt_python.memsys_enable_stats()
+    yield
+    _nrt_python.memsys_disable_stats()
+
+
+@pytest.mark.usefixtures("counted_memory")
+def test_of_tuples_only_the_owners_of_memory_are_taken(monkeypatch):
+    counts = []
+    add = JITCodeLibrary.add_ir_module
+
+    def counted(self, module):
+        counts.append(str(module).count(" = extractvalue "))
+        return add(self, module)
+
+    monkeypatch.setattr(JITCodeLibrary, "add_ir_module", counted)
+    pair = Pair(np.arange(3.0), np.ones(2))
+    for function in (njit(exchanged), with_internal_linkage(njit(exchanged))):
+        first = len(counts)
+        before = rtsys.get_allocation_stats()
+        result = function(pair)
+        np.testing.assert_array_equal(result.first, pair.first)
+        np.testing.assert_array_equal(result.second, pair.second)
+        del result
+        after = rtsys.get_allocation_stats()
+        assert after.alloc - before.alloc == after.free - before.free
+        counts[first:] = [sum(counts[first:])]
+    ordinary, own = counts
+    assert own < 0.7 * ordinary
+
+
+def test_garbage_collection_pauses_during_a_compilation_and_is_left_as_it_was(monkeypatch):
+    during = []
+    compile_extra = code_library.Compiler.compile_extra
+
+    def observed(self, function):
+        during.append(gc.isenabled())
+        return compile_extra(self, function)
+
+    monkeypatch.setattr(code_library.Compiler, "compile_extra", observed)
+    with_internal_linkage(njit(lambda x: x + 1.0))(0.5)
+    assert gc.isenabled()
+    gc.disable()
+    try:
+        with_internal_linkage(njit(lambda x: x + 2.0))(0.5)
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
+    assert during == [False, False]

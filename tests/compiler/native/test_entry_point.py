@@ -1,6 +1,5 @@
 """Entries: called by name and by address, and compiled once."""
 
-import gc
 from functools import partial
 from types import FunctionType
 
@@ -137,23 +136,3 @@ def test_code_is_kept_for_its_module():
         moved = njit(of_module(function, module))
         keys.append(CACHED_SRC_FUNCTIONS[cached_on_disk(moved).py_func])
     assert keys[0] != keys[1]
-
-
-def test_garbage_collection_pauses_during_a_compilation_and_is_left_as_it_was(monkeypatch):
-    during = []
-
-    class Compilation(entries.CFunc):
-        def compile(self):
-            during.append(gc.isenabled())
-            super().compile()
-
-    monkeypatch.setattr(entries, "CFunc", Compilation)
-    EntryPoint(scale, ARGUMENTS, "scale").compile()
-    assert gc.isenabled()
-    gc.disable()
-    try:
-        EntryPoint(scale, ARGUMENTS, "scale").compile()
-        assert not gc.isenabled()
-    finally:
-        gc.enable()
-    assert during == [False, False]
