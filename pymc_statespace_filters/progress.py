@@ -1,7 +1,9 @@
-"""Progress of rows and stages, and a line while machine code is compiled."""
+"""Progress of rows and stages, and what is said while machine code is compiled."""
 
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from threading import Timer
 from time import perf_counter
 from typing import Any, Protocol
@@ -113,16 +115,18 @@ def _quiet_compilation() -> Iterator[None]:
 
 @contextmanager
 def slow_compilation(name: str) -> Iterator[None]:
-    """Say in a terminal what is being compiled, if it takes longer than `PATIENCE`.
+    """Say what is being compiled, if it takes longer than `PATIENCE`.
 
-    The line disappears when the compilation ends.
+    The line in a terminal disappears when the compilation ends. Without a terminal PyMC's logger
+    has a line, one in a process.
     """
     console = Console(stderr=True)
-    if not console.is_terminal or _shown:
+    if _shown:
         yield
         return
-    status = console.status(f"Compiling {name}, once per installation ...")
-    timer = Timer(PATIENCE, status.start)
+    text = f"Compiling {name}, once per installation ..."
+    status = console.status(text) if console.is_terminal else None
+    timer = Timer(PATIENCE, status.start if status else partial(_log_first, text))
     timer.daemon = True
     timer.start()
     try:
@@ -131,4 +135,14 @@ def slow_compilation(name: str) -> Iterator[None]:
     finally:
         timer.cancel()
         timer.join()
-        status.stop()
+        if status:
+            status.stop()
+
+
+_logged: list[str] = []
+
+
+def _log_first(text: str) -> None:
+    if not _logged:
+        _logged.append(text)
+        logging.getLogger("pymc").info(text)

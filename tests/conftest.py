@@ -60,7 +60,13 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
-    """Say how pytest-xdist goes about it, and count compilations."""
+    """Say how pytest-xdist goes about it, and count compilations.
+
+    Nothing is said of a compilation, which takes as long as the machine lets it.
+    """
+    from pymc_statespace_filters import progress
+
+    progress.PATIENCE = 3600.0
     # Files are given to the processes in our order, not by their numbers of tests.
     config.option.loadscopereorder = False
     # A process that dies ends the run, which might wait for ever for the one in its place.

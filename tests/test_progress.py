@@ -1,4 +1,4 @@
-"""The line that says what is being compiled."""
+"""What is said of code that is being compiled."""
 
 from io import StringIO
 from time import sleep
@@ -37,11 +37,17 @@ def test_a_fast_or_failed_one_leaves_nothing_running(terminal):
     assert terminal.getvalue() == ""
 
 
-def test_without_a_terminal_nothing_is_written(capsys, monkeypatch):
-    monkeypatch.setattr(progress, "Timer", None)  # nor is anything started
+def test_without_a_terminal_the_log_says_once_what_is_compiled(capsys, caplog, monkeypatch):
+    caplog.set_level("INFO", "pymc")
+    monkeypatch.setattr(progress, "_logged", [])
     with progress.slow_compilation("pf_enkf"):
         pass
-    assert capsys.readouterr() == ("", "")
+    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    for name in ("the model", "pf_enkf"):
+        with progress.slow_compilation(name), progress.slow_compilation("a part"):
+            sleep(0.2)
+    assert caplog.messages == ["Compiling the model, once per installation ..."]
+    assert capsys.readouterr().out == ""
 
 
 def test_parts_of_a_compilation_and_what_a_bar_shows_have_no_line_of_their_own(terminal):

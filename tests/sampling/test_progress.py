@@ -3,6 +3,7 @@
 import contextlib
 import io
 import sys
+from threading import current_thread, main_thread
 from types import SimpleNamespace
 
 import pymc as pm
@@ -15,6 +16,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters import progress
 from pymc_statespace_filters.sampling.nuts import chains
 from pymc_statespace_filters.sampling.output.chain_bars import ChainProgress
+from pymc_statespace_filters.sampling.run.chain import Chain
 from pymc_statespace_filters.sampling.step import DRAM
 
 TUNE, DRAWS = 100, 900
@@ -152,6 +154,20 @@ def test_bars_of_nuts_end_with_the_last_iteration(updates, monkeypatch, capfd):
     settings = {"sampler": "nuts", "until_ess": None, "initvals": {"mu": 0.5}}
     psf.sample(10, tune=8, chains=2, model=model(), **settings)
     assert {chain: done for chain, done, _ in updates} == {0: 18, 1: 18}
+
+
+def test_a_chain_finds_its_iterations_compiled(monkeypatch):
+    """Its clock and its bar count no compilation."""
+    iterate, made = Chain._iterate, []
+
+    def noted(chain, *arguments):
+        made.append((current_thread() is main_thread(), arguments[-1]))
+        return iterate(chain, *arguments)
+
+    monkeypatch.setattr(Chain, "_iterate", noted)
+    psf.sample_dram(10, tune=8, chains=2, until_ess=None, model=model(), random_seed=1)
+    assert made[0] == (True, 0)
+    assert {in_main for in_main, _ in made[1:]} == {False}
 
 
 def test_a_row_that_was_an_estimate_is_whole_at_the_end(monkeypatch):

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...parallel.signals import held_interrupts
+from ...progress import slow_compilation
 from ..kernel.state import (
     ACCEPTANCE,
     BLOCK,
@@ -81,6 +82,11 @@ class ChainArrays:
         self._block: tuple[int, Any] | None = None
         # Counts of the row that was not full when the draws were last saved.
         self._saved_counts = np.zeros(n_counts, dtype=np.int64)
+
+    def compile(self) -> None:
+        """Compile the iterations, or load them from disk, without making one."""
+        with slow_compilation("the random walk"):
+            self.advance(True, 0, 0, 0)
 
     def advance(self, tune: bool, iteration: int, row: int, n: int) -> int:
         """Make up to n iterations, within one block of random numbers, and record them from a row.

@@ -29,6 +29,7 @@ from .population_search import (
     search_population,
     stops_of,
 )
+from .record_chain import chain_of
 from .request import ExecutionOptions, SamplingRequest
 from .stopping import Length, first_length, next_length
 from .thinned_draws import Thinning
@@ -105,6 +106,8 @@ class ModelTask:
             )
             self._target = target
             target.prepare()
+            # Before the clocks and the bars of chains begin.
+            chain_of(target, np.zeros(2, dtype=np.uint64), n_rows=0, n_covs=0).compile()
             self._seeds = np.random.SeedSequence(request.entropy).spawn(request.chains)
             self._candidates = chain_candidates(
                 self.model,
