@@ -113,6 +113,7 @@ def study(args: argparse.Namespace) -> str:
     models = {name: rival(names, filter, steps, values) for name, names in RIVALS.items()}
     results = psf.run_models(
         models,
+        sampler="dram",
         draws=args.draws,
         tune=args.tune,
         chains=args.chains,

@@ -54,7 +54,7 @@ def run_models(
 def run_models(
     models: Mapping[str, Model],
     *,
-    sampler: Literal["auto", "nuts", "dram", "smc"] = "dram",
+    sampler: Literal["auto", "nuts", "dram", "smc"] = "auto",
     pilot: DataTree | Mapping[str, DataTree] | None = None,
     checkpoint: Any = None,
     comm: Any = None,
@@ -62,16 +62,17 @@ def run_models(
 ) -> dict[str, DataTree] | None:
     """Sample several models in one run, each as by `sample`, `sample_dram` or `sample_smc`.
 
-    The chains of `sample_dram` of all models share the threads, and with MPI the ranks: an idle
-    thread takes the next chain, most expensive model first. Runs of the others, each of which uses
-    all threads, follow one another; those of `sample_smc` store the evidences for
-    `compare_evidence`.
+    Runs of `sample` and `sample_smc`, each of which uses all threads, follow one another; those of
+    `sample_smc` store the evidences for `compare_evidence`. The chains of `sample_dram` of all
+    models share the threads, and with MPI the ranks: an idle thread takes the next chain, most
+    expensive model first.
 
     Parameters
     ----------
     models : mapping of str to pymc.Model
-    sampler : {"dram", "auto", "nuts", "smc"}
+    sampler : {"auto", "nuts", "dram", "smc"}
         "auto" and "nuts" are those of `sample`, "dram" is `sample_dram`, and "smc" `sample_smc`.
+        With ``comm`` or ``checkpoint`` "auto" is the random walk, as in `sample`.
     pilot : xarray.DataTree, or mapping of str to xarray.DataTree, optional
         As in `sample_dram`, of the models with these names. A single one is the pilot of every
         model that has a free variable in common with it. Only with "dram".

@@ -65,6 +65,7 @@ def timed(rivals: dict[str, pm.Model], tune: int, draws: int) -> tuple[float, fl
     wall, cpu = time.perf_counter(), cpu_seconds()
     found = psf.run_models(
         rivals,
+        sampler="dram",
         draws=draws,
         tune=tune,
         chains=CHAINS,

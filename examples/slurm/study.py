@@ -51,6 +51,7 @@ def study(out, quick):
     models = {name: rival(names, filter, steps, record) for name, names in RIVALS.items()}
     results = psf.run_models(
         models,
+        sampler="dram",
         draws=draws,
         tune=draws // 2,
         random_seed=1,

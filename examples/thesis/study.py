@@ -74,7 +74,7 @@ class Study:
     ) -> dict[str, xr.DataTree]:
         """Sample several models by `psf.run_models`; otherwise as `sample`."""
         settings = self.sampling(name) | changes
-        found = psf.run_models(models, **settings)
+        found = psf.run_models(models, sampler="dram", **settings)
         return {of: _whole(draws, settings) for of, draws in found.items()}
 
     def evidence(self, name: str, draws: xr.DataTree, model: pm.Model) -> Evidence:

@@ -55,7 +55,7 @@ def sample(
     """Draw from the posterior of a model, by the sampler that suits it.
 
     The random walk of `sample_dram` runs first, from points found as by `find_starts`, and again
-    from its own points where its draws are not worth enough. Where 64 ``draws`` iterations of each
+    from its own points where its draws are not worth enough. Where 256 ``draws`` iterations of each
     chain are too few, and every likelihood has a gradient, NUTS (of nutpie) starts at its points.
     Where NUTS takes more evaluations than the walk would, or diverges, the walk goes on from the
     points that are worth most. The report says what was tried, and what came of it.

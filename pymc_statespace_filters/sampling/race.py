@@ -28,9 +28,10 @@ from .run.stopping import expected_iterations, is_enough
 from .target.record_target import RecordTarget
 
 # Iterations of the first walk, in draws; by how much each is longer than the one before; and those
-# of the last one before NUTS, which all together take about as much as the first run of NUTS.
-_FIRST, _LONGER, _WALK = 4, 4, 64
-_UNKNOWN = 16.0  # by which draws of proposals that are still poor may underrate the walk
+# of the last one before NUTS. NUTS needs the evaluations of the last but one before its draws are
+# looked at for the first time, and would hardly gain on a walk of which they are worth something.
+_FIRST, _LONGER, _WALK = 4, 4, 256
+_UNKNOWN = 4.0  # by which draws of proposals that are still poor may underrate the walk
 _GRADIENT = 4.0  # log-densities that a gradient takes: 3 to 6
 _MARGIN = 2.0  # by which NUTS may exceed what the walk is expected to take, an estimate
 _MOST_SPENT = 16.0  # by which it may exceed what the walks have taken
@@ -121,10 +122,11 @@ def _is_good(run: EndedRun, goal: SamplingRequest) -> bool:
 
 
 def _from_points(request: SamplingRequest, runs: list[EndedRun]) -> SamplingRequest:
-    """A walk from the points that are worth most."""
+    """A walk from the points of the last one, which has seen most, or of NUTS if worth more."""
     if isinstance(runs[0].target, RecordTarget):  # whose records find their own starts
         return request
-    points = max(runs, key=_effective).positions
+    walk, *nuts = runs[-2:] if isinstance(runs[-1], EndedNuts) else runs[-1:]
+    points = max([walk, *nuts], key=_effective).positions
     return request._replace(pilot=points[:: -(-len(points) // _N_POINTS)].tolist())
 
 

@@ -17,6 +17,7 @@ def draws_of_all(**settings):
     """Everything that was drawn, by model, group and name; of unequal costs, some with warm-up."""
     trees = psf.run_models(
         {name: state_space_model(*filters) for name, filters in FILTERS.items()},
+        sampler="dram",
         draws=150,
         tune=300,
         chains=3,

@@ -71,7 +71,10 @@ def disagreements(comm):
     for changes in variants:
         with pytest.raises(psf.errors.DataMismatchError) as caught:
             psf.run_models(
-                **with_kernel({"models": {"M": model}} | call | (changes if comm.rank == 1 else {}))
+                sampler="dram",
+                **with_kernel(
+                    {"models": {"M": model}} | call | (changes if comm.rank == 1 else {})
+                ),
             )
         heard.append(str(caught.value))
     return heard

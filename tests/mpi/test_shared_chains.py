@@ -29,7 +29,9 @@ def draws_of_all(**settings):
     """Everything that was drawn, by model, group and name."""
     return {
         (model, group, name): values.to_numpy()
-        for model, tree in psf.run_models(models(), **with_kernel(SETTINGS | settings)).items()
+        for model, tree in psf.run_models(
+            models(), sampler="dram", **with_kernel(SETTINGS | settings)
+        ).items()
         for group in ("posterior", "warmup_posterior", "sample_stats")
         for name, values in tree[group].data_vars.items()
     }

@@ -71,7 +71,7 @@ def test_nothing_is_said_where_nothing_was_compared(caplog):
 def test_several_models_are_named():
     models = {"bent": model_of(1.0), "exact": model_of(1.0, psf.GridFilter())}
     with pytest.warns(psf.errors.FilterWarning, match=r"^Model 'bent': d: EKF") as caught:
-        trees = psf.run_models(models, progressbar=False, **SETTINGS)
+        trees = psf.run_models(models, sampler="dram", progressbar=False, **SETTINGS)
     assert len(caught) == 1
     assert {name: outcome_of(tree) for name, tree in trees.items()} == {
         "bent": "off",

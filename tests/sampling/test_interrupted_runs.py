@@ -100,7 +100,7 @@ def calls(monkeypatch):
         "sample": lambda: psf.sample(model=both["one"], **by_nuts),
         "tempered": lambda: psf.sample_smc(model=both["one"], **particles),
         "sequential": lambda: psf.sample_smc(model=record, data="sequential", **particles),
-        "run_models": lambda: psf.run_models(both, **few),
+        "run_models": lambda: psf.run_models(both, sampler="dram", **few),
         "run_models, particles": lambda: psf.run_models(both, sampler="smc", **particles),
     }
 

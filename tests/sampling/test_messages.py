@@ -47,7 +47,8 @@ def suggest(**arguments):
 
 def run_models(**arguments):
     return psf.run_models(
-        **with_kernel({"models": {"a": simple_model()}, "progressbar": False} | arguments)
+        sampler="dram",
+        **with_kernel({"models": {"a": simple_model()}, "progressbar": False} | arguments),
     )
 
 

@@ -53,7 +53,7 @@ def test_two_modes_are_reported_in_the_models_units(caplog):
 
 def test_modes_are_reported_by_sample_dram_with_the_name_of_the_model(caplog):
     models = {"one": mixture((1.0, 2.0)), "two": mixture((0.5, 0.05), (0.5, 20.0))}
-    psf.run_models(models, draws=20, tune=20, random_seed=1, progressbar=False)
+    psf.run_models(models, sampler="dram", draws=20, tune=20, random_seed=1, progressbar=False)
     (message,) = reported(caplog)
     assert message.startswith("Model 'two': The posterior has 2 separate modes")
 

@@ -147,8 +147,8 @@ def models():
 
 def test_run_models_gives_a_pilot_to_the_models_that_share_variables(smaller):
     asked = {"draws": 30, "tune": 20} | QUIET
-    together = psf.run_models(models(), pilot=smaller, **asked)
-    some = psf.run_models(models(), pilot={"line": smaller}, **asked)
+    together = psf.run_models(models(), sampler="dram", pilot=smaller, **asked)
+    some = psf.run_models(models(), sampler="dram", pilot={"line": smaller}, **asked)
     for name, model in models().items():
         alone = psf.sample_dram(model=model, pilot=None if name == "other" else smaller, **asked)
         without = psf.sample_dram(model=model, **asked)
@@ -179,4 +179,4 @@ STRANGE = az.from_dict({"posterior": {"w": np.random.default_rng(4).normal(size=
 )
 def test_pilots_of_run_models_are_checked(pilot, error, message):
     with pytest.raises(error, match=message):
-        psf.run_models(models(), pilot=pilot, **QUIET)
+        psf.run_models(models(), sampler="dram", pilot=pilot, **QUIET)

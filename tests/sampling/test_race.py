@@ -90,7 +90,7 @@ def test_a_walk_goes_on_longer_from_its_own_points(caplog, walks, monkeypatch):
     assert idata.attrs["sampler"] == "dram"
     assert idata.attrs["sampler_reason"].startswith("DRAM, from points of its own, made draws")
     assert not any("NUTS, from its points" in text for text in said)
-    assert [walk.max_draws for walk in walks] == [1000, 4000, 16000][: len(walks)]
+    assert [walk.max_draws for walk in walks] == [1000 * 4**i for i in range(len(walks))]
     assert len({tuple(walk.entropy) for walk in walks}) == len(walks) > 1
     assert walks[0].pilot is None
     assert np.shape(walks[1].pilot) == (4000, 10)
@@ -103,9 +103,9 @@ def test_what_a_race_takes_is_bounded(caplog, walks):
     (told,) = (text for text in said if text.startswith("DRAM, from points of its own, would take"))
     assert "DRAM, from the better points," in told
     made = [walk.max_draws // 20 for walk in walks]
-    assert made[:3] == [4, 16, 64]
-    most = 84 * (1 + race._MOST_SPENT) + 2000  # which NUTS makes before it is looked at
-    assert 0 < sum(made[3:]) < 4 / 3 * most
+    assert made[:4] == [4, 16, 64, 256]
+    most = 340 * (1 + race._MOST_SPENT) + 2000  # which NUTS makes before it is looked at
+    assert 0 < sum(made[4:]) < 4 / 3 * most
 
 
 def test_nuts_from_the_points_of_a_slow_walk(caplog, nuts_follows):

@@ -158,7 +158,9 @@ def test_elements_of_vectors_are_named(report_of):
 
 def test_models_are_named(caplog):
     with caplog.at_level(logging.DEBUG, logger=LOGGER):
-        psf.run_models({"one": simple_model()}, draws=50, tune=50, chains=2, progressbar=False)
+        psf.run_models(
+            {"one": simple_model()}, sampler="dram", draws=50, tune=50, chains=2, progressbar=False
+        )
     assert any(text.startswith("Model 'one': 2 chains of 50 draws") for text in caplog.messages)
 
 

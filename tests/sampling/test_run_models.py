@@ -5,6 +5,7 @@ import re
 import tracemalloc
 import weakref
 from dataclasses import fields
+from functools import partial
 from inspect import signature
 
 import numpy as np
@@ -30,6 +31,9 @@ from tests.sampling.test_sample_dram import LOGGER, assert_identical, sample_dra
 SETTINGS = {"draws": 50, "tune": 50, "chains": 2, "random_seed": 1, "progressbar": False}
 
 
+run_chains = partial(psf.run_models, sampler="dram")
+
+
 def request():
     return SamplingRequest(50, 50, 2, [1], True, None, False, None, RandomWalkSettings())
 
@@ -46,7 +50,7 @@ def models():
 
 
 def test_each_model_as_if_alone(models):
-    trees = psf.run_models(models, **SETTINGS)
+    trees = run_chains(models, **SETTINGS)
     assert list(trees) == list(models)
     for name, model in models.items():
         assert_identical(trees[name], sample_dram(model, **SETTINGS))
@@ -57,7 +61,7 @@ def test_the_dearest_chains_begin(models, monkeypatch):
     monkeypatch.setattr(
         ChainPool, "start", lambda pool, *of: (order.append(of[0]), start(pool, *of))[1]
     )
-    psf.run_models(models, **SETTINGS)
+    run_chains(models, **SETTINGS)
     assert list(dict.fromkeys(order)) == [2, 3, 0, 1]  # each again after a part of its warm-up
 
 
@@ -86,28 +90,28 @@ def test_threads_are_shared_by_all_models(models, monkeypatch):
         "finished",
         lambda pool, *of: (at_once.append(len(pool.running)), finished(pool, *of))[1],
     )
-    psf.run_models(models, cores=3, **SETTINGS)
+    run_chains(models, cores=3, **SETTINGS)
     assert max(at_once) >= 3  # with those that wait for a thread to go on
 
 
 @pytest.mark.usefixtures("interrupts_arrive")
 def test_an_interrupted_study_goes_on(models, tmp_path, monkeypatch):
     settings = SETTINGS | {"tune": 400}  # long enough for a search by the expensive filter
-    expected = psf.run_models(models, **settings)
+    expected = run_chains(models, **settings)
     settings |= {"checkpoint": tmp_path, "cores": 2}
 
     with monkeypatch.context() as patch:
         interrupt_chains(patch)
         with pytest.raises(KeyboardInterrupt, match="before there was a draw"):  # in the warm-up
-            psf.run_models(models, **settings)
+            run_chains(models, **settings)
     files = [RecordFile(path, header_of(path)) for path in tmp_path.glob("*/run.checkpoint")]
     stored = [[key for key in ("starts", "chain 0", "chain 1") if file.read(key)] for file in files]
     assert sorted(map(len, stored)) == [1, 3]  # one had not begun
-    trees = psf.run_models(models, **settings)
+    trees = run_chains(models, **settings)
     for name in models:
         assert_identical(trees[name], expected[name])
     with pytest.raises(DataMismatchError, match="draws: "):
-        psf.run_models(models, **settings | {"draws": 60})
+        run_chains(models, **settings | {"draws": 60})
 
 
 @pytest.mark.usefixtures("interrupts_arrive")
@@ -123,10 +127,10 @@ def test_an_interrupt_keeps_the_model_that_has_draws(models, monkeypatch, caplog
             start(pool, number, task)
 
     settings = SETTINGS | {"tune": 0, "cores": 1}
-    expected = psf.run_models({"dear/one": models["dear/one"]}, **settings)
+    expected = run_chains({"dear/one": models["dear/one"]}, **settings)
     with monkeypatch.context() as patch:
         patch.setattr(ChainPool, "start", interrupted)
-        trees = psf.run_models(models, **settings)
+        trees = run_chains(models, **settings)
     assert list(trees) == ["dear/one"]
     assert trees["dear/one"].sizes == expected["dear/one"].sizes
     (said,) = [r.message for r in caplog.records if "interrupted" in r.message]
@@ -137,7 +141,7 @@ def test_an_interrupt_keeps_the_model_that_has_draws(models, monkeypatch, caplog
 
 def test_messages_name_the_model(caplog):
     models = {"first": normal_model(), "second": normal_model(3.0)}
-    psf.run_models(
+    run_chains(
         models, **SETTINGS | {"tune": 0}, kernel={"proposal_cov": [[1e12]]}
     )  # they stand still
     named = [re.match(r"Model '(\w+)': ", record.message) for record in caplog.records]
@@ -203,7 +207,7 @@ def test_an_error_names_chain_and_model(models):
     with pm.Model() as broken:
         pm.Potential("p", wrap_py([pt.dscalar], [pt.dscalar])(breaking)(pm.Normal("mu", 0, 3)))
     with pytest.raises(ArithmeticError) as caught:
-        psf.run_models(models | {"broken": broken}, **SETTINGS | {"draws": 10**5}, initvals={})
+        run_chains(models | {"broken": broken}, **SETTINGS | {"draws": 10**5}, initvals={})
     assert re.fullmatch(
         r"in chain \d of model 'broken', after \d+ iterations", caught.value.__notes__[-1]
     )
@@ -237,6 +241,10 @@ def test_samplers_and_arguments_of_sample(caplog):
             sampler.replace("auto", "dram")
         }
         if sampler == "auto":
+            assert_identical(
+                psf.run_models(rivals, until_ess=50, max_draws=240, **settings)["wide"],
+                trees["wide"],
+            )
             alone = psf.sample(until_ess=50, max_draws=240, model=rivals["wide"], **settings)
             assert_identical(trees["wide"], alone)
     of_sample = signature(psf.sample).parameters.keys()

@@ -200,7 +200,9 @@ def test_the_warm_up_is_kept(model, stopped):
 
 def test_each_model_stops_on_its_own(model, stopped):
     models = {"one": model, "other": line()}
-    trees = psf.run_models(models, random_seed=1, progressbar=False, cores=2, **RULE)
+    trees = psf.run_models(
+        models, sampler="dram", random_seed=1, progressbar=False, cores=2, **RULE
+    )
     assert_identical(trees["one"], stopped)
     alone = sample_dram(models["other"], **RULE)
     assert_identical(trees["other"], alone)
