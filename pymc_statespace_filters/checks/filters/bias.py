@@ -6,16 +6,27 @@ a reference that is close to the likelihood: an exact filter, or particles that 
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri, stdtrit
+from scipy.special import stdtrit
 
 from ...filters.protocol import Filter
 from ...filters.written import short_form
+from .difference import Difference, difference
 from .estimates import Comparison, Estimates
-from .finding import ALPHA, FINE, OFF, TOLERATED, UNDECIDED, VISIBLE, Finding, cure, nats
+from .finding import (
+    ALPHA,
+    FINE,
+    OFF,
+    TOLERATED,
+    UNDECIDED,
+    VISIBLE,
+    Finding,
+    cure,
+    nats,
+    scatter_of,
+)
 from .low import shortfall, without_likelihood
 
 Array = NDArray[np.float64]
@@ -28,35 +39,6 @@ _FEWEST = 4  # draws, from which a covariance is taken
 _HIGHER = 0.3
 _QUIET = 0.5  # nats by which guided particles scatter at most, whose mean is trusted without others
 _N_ERRORS = 3.0
-
-
-class _Difference(NamedTuple):
-    """Filter minus reference at n draws: the mean, its standard error, and the spread.
-
-    The spread is the standard deviation without the part that is due to the noise of both.
-    """
-
-    n: int
-    mean: float
-    se: float
-    spread: float
-
-    @property
-    def margin(self) -> float:
-        """Half of the confidence interval of the mean."""
-        return float(stdtrit(max(self.n - 1, 1), 1.0 - ALPHA / 2.0) * self.se)
-
-    @property
-    def least_spread(self) -> float:
-        """The lower end of an interval for the spread, as if differences were normal."""
-        dof = max(self.n - 1, 1)
-        return float(self.spread * np.sqrt(dof / chdtri(dof, ALPHA)))
-
-    @property
-    def most_spread(self) -> float:
-        """The upper end, with the noise: no parameter is moved by more standard deviations."""
-        dof = max(self.n - 1, 1)
-        return float(self.se * np.sqrt(self.n * dof / chdtri(dof, 1.0 - ALPHA)))
 
 
 def not_compared(filter: Filter, reason: str) -> Finding:
@@ -75,7 +57,7 @@ def bias_at_draws(found: Comparison, x: Array, names: Sequence[str]) -> list[Fin
     name, reference = short_form(found.checked.filter), reference_of(found)
     if reference is None:
         return [_without_reference(found, name)]
-    bias, other = _difference(found.checked, reference), short_form(reference.filter)
+    bias, other = difference(found.checked, reference), short_form(reference.filter)
     if bias.n < 2:
         return [not_compared(found.checked.filter, f"{other} fails at draws")]
     moved = _shifts(reference.mean - found.checked.mean, x, names, bias)
@@ -129,7 +111,7 @@ def bias_elsewhere(found: Comparison, draws: Comparison) -> list[Finding]:
     if reference is None:
         return []
     name = short_form(found.checked.filter)
-    usual = _difference(draws.checked, reference)
+    usual = difference(draws.checked, reference)
     proved = shortfall(found, found.checked.mean - usual.mean) - _N_ERRORS * usual.se
     if proved > VISIBLE + _N_ERRORS * usual.spread:
         outcome = OFF
@@ -174,25 +156,10 @@ def _without_reference(draws: Comparison, name: str) -> Finding:
             f"log-evidence. {cure(draws)}"
         )
         return Finding("bias", -proved, np.nan, ALPHA, np.nan, OFF, verdict)
-    scatters = [
-        f"{short_form(one.filter)} scatters by {nats(one.scatter)} nats" for one in draws.unbiased
-    ]
-    return not_compared(draws.checked.filter, " and ".join(scatters))
+    return not_compared(draws.checked.filter, scatter_of(draws))
 
 
-def _difference(checked: Estimates, reference: Estimates) -> _Difference:
-    values = checked.mean - reference.mean
-    known = np.isfinite(values)
-    noise = float(np.mean((checked.error**2 + reference.error**2)[known])) if known.any() else 0.0
-    n = int(known.sum())
-    if n < 2:
-        return _Difference(n, np.nan, np.inf, np.nan)
-    variance = float(values[known].var(ddof=1))
-    spread = np.sqrt(max(variance - noise, 0.0))
-    return _Difference(n, float(values[known].mean()), np.sqrt(max(variance, noise) / n), spread)
-
-
-def _shifts(lost: Array, x: Array, names: Sequence[str], bias: _Difference) -> list[Finding]:
+def _shifts(lost: Array, x: Array, names: Sequence[str], bias: Difference) -> list[Finding]:
     """By how many posterior standard deviations what the filter lacks moves each parameter.
 
     To first order, its covariance with the parameter over the parameter's standard deviation: at

@@ -183,7 +183,7 @@ def _check_variable(
     if not budget.is_spent:
         points, factors = points_elsewhere(model, draws, n_elsewhere, rng)
         others = evaluate(variable.moved_to(points), filters)
-        others = others.at(_is_relevant(model, name, found, x, others, points, factors))
+        others = others.at(_is_relevant(model, name, (x, found), (points, others), factors))
         if len(others.checked.logs):
             is_low = bias_elsewhere(others, found) if scored else [low_at(others, "elsewhere")]
     while n_draws < len(x) and not (is_settled(findings) or budget.is_spent):
@@ -196,26 +196,21 @@ def _check_variable(
 def _is_relevant(
     model: pm.Model,
     name: str,
-    at_draws: Comparison,
-    x: Array,
-    elsewhere: Comparison,
-    points: Array,
+    draws: tuple[Array, Comparison],
+    others: tuple[Array, Comparison],
     factors: Array,
 ) -> NDArray[np.bool_]:
-    """Which points the posterior would hold, by the highest of all estimates there."""
-    highest = np.concatenate([at_draws.highest, elsewhere.highest])
-    n, m = len(at_draws.highest), len(elsewhere.highest)
-    density = highest + _density_of_others(model, name, np.concatenate([x[:n], points[:m]]))
-    allowed = _SLACK + x.shape[1] * np.log(factors[:m])
+    """Which other points the posterior would hold, by the highest of all estimates there.
+
+    Of points that were compared, the first: the others have no estimates.
+    """
+    terms = [term.sum() for variable, term in log_density_terms(model) if variable != name]
+    highest = [found.highest for _, found in (draws, others)]
+    n, m = map(len, highest)
+    x = np.concatenate([draws[0][:n], others[0][:m]])
+    density = np.concatenate(highest) + np.sum(GraphsAtPoints(model, terms)(x), axis=0)
     lowest = density[:n][np.isfinite(density[:n])].min(initial=np.inf)
-    return density[n:] >= lowest - allowed
-
-
-def _density_of_others(model: pm.Model, name: str, x: Array) -> Array:
-    """The log-density of all variables and Potentials but one, (m,)."""
-    others = [term.sum() for variable, term in log_density_terms(model) if variable != name]
-    found = np.sum(GraphsAtPoints(model, others)(x), axis=0)
-    return np.where(np.isnan(found), -np.inf, found)
+    return density[n:] >= lowest - _SLACK - x.shape[1] * np.log(factors[:m])
 
 
 def outcomes_of(table: pd.DataFrame) -> dict[str, dict[str, str]]:

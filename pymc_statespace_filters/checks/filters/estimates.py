@@ -29,7 +29,8 @@ from .budget import Budget
 Array = NDArray[np.float64]
 
 _ONE_SEED = np.zeros((1, 1), dtype=np.int64)
-N_SEEDS, N_GUIDED_SEEDS = 4, 2  # of noisy filters at each point; guided ones scatter less
+_N_SEEDS = 6  # of noisy filters at each point
+_N_GUIDED_SEEDS = 2  # of guided witnesses of an approximation, trusted where they hardly scatter
 _AT_ONCE, _FEWEST = 2, 4  # points, after which the time is looked at, and at least
 _QUICK = 0.02  # CPU seconds of an evaluation with which an exact filter suits a chain
 # CPU seconds in which the loops of a filter are compiled, once per installation.
@@ -157,7 +158,9 @@ def compare(
     for first in range(0, len(variable), _AT_ONCE):
         points = range(first, min(first + _AT_ONCE, len(variable)))
         for one, logs in zip(filters, found, strict=True):
-            seeds = rng.integers(2**62, size=(len(points), _n_seeds(one)))
+            is_quiet = scored and isinstance(one, GuidedPF)
+            n_seeds = _N_GUIDED_SEEDS if is_quiet else _N_SEEDS if one.noisy else 1
+            seeds = rng.integers(2**62, size=(len(points), n_seeds))
             logs.append(variable.at(points, one, seeds, scored=scored))
         budget.on_progress(len(points))
         if budget.is_spent and points.stop >= _FEWEST:
@@ -166,12 +169,6 @@ def compare(
         Estimates(f, np.concatenate(logs)) for f, logs in zip(filters, found, strict=True)
     )
     return Comparison(checked, tuple(others))
-
-
-def _n_seeds(filter: Filter) -> int:
-    if not filter.noisy:
-        return 1
-    return N_GUIDED_SEEDS if isinstance(filter, GuidedPF) else N_SEEDS
 
 
 def is_unbiased(filter: Filter) -> bool:
@@ -214,7 +211,7 @@ def _candidates(variable: VariableAtPoints, filter: Filter, budget: Budget) -> l
     system = compile_system(variable.system)
     exact = exact_filter(system, without=filter)
     found: list[Filter] = [] if exact is None else [exact]
-    number = budget.n_particles(N_SEEDS * len(variable), variable.n_steps, system.n)
+    number = budget.n_particles(_N_SEEDS * len(variable), variable.n_steps, system.n)
     taken = filters_for(system)
     regimes = [one for one in taken if isinstance(one, RBPF) and one.is_exact_for(system)]
     plain: list[Filter] = [one for one in taken if isinstance(one, BootstrapPF)]

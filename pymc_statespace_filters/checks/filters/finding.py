@@ -45,6 +45,15 @@ def nats(value: float) -> str:
     return f"{value:.1f}" if abs(value) < 10.0 else f"{value:.0f}"
 
 
+def scatter_of(found: Comparison) -> str:
+    """How much the noisy filters scatter, as a reason."""
+    return " and ".join(
+        f"{short_form(one.filter)} scatters by {nats(one.scatter)} nats"
+        for one in (found.checked, *found.witnesses)
+        if one.filter.noisy
+    )
+
+
 def cure(found: Comparison) -> str:
     """Name a filter that works at these points; a sentence."""
     plain = found.plain if found.plain is not None and found.plain.is_usable else None

@@ -9,9 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...filters.written import short_form
+from .difference import difference
 from .e_values import proved_shortfall, visible_shortfall
 from .estimates import Comparison
-from .finding import ALPHA, FINE, OFF, TOLERATED, UNDECIDED, VISIBLE, Finding, cure, nats
+from .finding import (
+    ALPHA,
+    FINE,
+    OFF,
+    TOLERATED,
+    UNDECIDED,
+    VISIBLE,
+    Finding,
+    cure,
+    nats,
+    scatter_of,
+)
 
 _N_ERRORS = 3.0  # standard errors, where the other filter has none
 
@@ -57,39 +69,21 @@ def low_at(found: Comparison, where: str) -> Finding:
     if (lost := without_likelihood(found, f"low {where}", where)) is not None:
         return lost
     checked, name = found.checked, short_form(found.checked.filter)
-    error = checked.typical_error
-    proved = shortfall(found, checked.mean) - _N_ERRORS * error
-    statistic, se = _difference(found)
+    proved = shortfall(found, checked.mean) - _N_ERRORS * checked.typical_error
+    mean = difference(checked, found.exact or found.plain or found.witnesses[0])
     visible = _visible(found)
-    check = f"low {where}"
     if proved > TOLERATED:
         scatter = f"its estimates scatter by {nats(checked.scatter)} nats over seeds"
         but = f", although {scatter}" if checked.is_usable else f"; {scatter}"
+        outcome = OFF
         verdict = f"{name} is too low {where}, by {nats(proved)} nats at least{but}. {cure(found)}"
-        return Finding(check, statistic, se, ALPHA, visible, OFF, verdict)
-    if visible <= VISIBLE:
-        verdict = (
-            f"no sign that {name} is too low {where}; {nats(max(visible, 0.1))} nats would have "
-            "been seen"
-        )
-        return Finding(check, statistic, se, ALPHA, visible, FINE, verdict)
-    verdict = (
-        f"undecided whether {name} is too low {where}: {_why(found)}, too much to prove less than "
-        f"{nats(visible)} nats"
-    )
-    return Finding(check, statistic, se, ALPHA, visible, UNDECIDED, verdict)
-
-
-def _difference(found: Comparison) -> tuple[float, float]:
-    """Mean of the checked estimates minus those of exact or plain particles, with its error."""
-    other = found.exact or found.plain
-    if other is None:
-        return np.nan, np.nan
-    difference = found.checked.mean - other.mean
-    difference = difference[np.isfinite(difference)]
-    if difference.size < 2:
-        return np.nan, np.nan
-    return float(difference.mean()), float(difference.std(ddof=1) / np.sqrt(difference.size))
+    elif visible <= VISIBLE:
+        outcome, seen = FINE, f"{nats(max(visible, 0.1))} nats would have been seen"
+        verdict = f"no sign that {name} is too low {where}; {seen}"
+    else:
+        outcome, why = UNDECIDED, f"too much to prove less than {nats(visible)} nats"
+        verdict = f"undecided whether {name} is too low {where}: {scatter_of(found)}, {why}"
+    return Finding(f"low {where}", mean.mean, mean.se, ALPHA, visible, outcome, verdict)
 
 
 def _visible(found: Comparison) -> float:
@@ -103,15 +97,3 @@ def _visible(found: Comparison) -> float:
         found.plain.logs[known], found.checked.mean[known], ALPHA / n_witnesses
     )
     return seen + _N_ERRORS * found.checked.typical_error
-
-
-def _why(found: Comparison) -> str:
-    other = found.exact or found.plain
-    if other is None:
-        return "no filter without a guide takes this system"
-    if found.plain is None or found.plain.scatter < found.checked.scatter:
-        return f"its own estimates scatter by {nats(found.checked.scatter)} nats"
-    return (
-        f"plain particles, {short_form(found.plain.filter)}, scatter by "
-        f"{nats(found.plain.scatter)} nats"
-    )

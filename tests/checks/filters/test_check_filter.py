@@ -179,6 +179,20 @@ def test_without_time_to_compile_a_filter_the_check_is_undecided(monkeypatch):
     assert "BootstrapPF(" in found["d"]["verdict"]
 
 
+def test_more_draws_are_compared_until_they_are_enough(monkeypatch):
+    judge, numbers = checks.bias_at_draws, []
+
+    def counted(found, x, names):
+        numbers.append(len(x))
+        assert len(found.checked.logs) == len(x)
+        return judge(found, x, names)
+
+    monkeypatch.setattr(checks, "bias_at_draws", counted)
+    monkeypatch.setattr(checks, "is_settled", lambda findings: False)
+    psf.check_filter(draws_of(), model_of(SQUARE, psf.EKF(), record_of(SQUARE, phi=0.8)))
+    assert numbers == [10, 40, 160]
+
+
 def test_some_points_are_evaluated_however_little_time_there_is(monkeypatch):
     monkeypatch.setattr(estimates.Budget, "is_spent", True)
     model = model_of(SQUARE, psf.EKF(), record_of(SQUARE, phi=0.8))
