@@ -23,6 +23,7 @@ import pytensor.tensor as pt
 from scipy.special import logsumexp
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.checks.filters.budget import Budget
 from pymc_statespace_filters.checks.filters.checks import check_model, outcomes_of
 
 TABLE = Path(__file__).parents[1] / "docs" / "_static" / "filter_check.inc"
@@ -152,7 +153,7 @@ def checked(number: int) -> Result | None:
         psf.StateSpace("d", system, filter, params=params, steps=steps, observed=observed)
     idata = az.from_dict({"posterior": {"a": draws}})
     began = time.process_time()
-    table = check_model(idata, model, filter=None, n_points=20, seconds=allowed, rng=rng)
+    table = check_model(idata, model, filter=None, n_points=20, budget=Budget(allowed), rng=rng)
     seconds = time.process_time() - began
     return Result(name, type(filter).__name__, error, outcomes_of(table)["d"]["outcome"], seconds)
 

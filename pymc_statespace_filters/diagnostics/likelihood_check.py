@@ -7,6 +7,7 @@ import pandas as pd
 import pymc as pm
 import xarray as xr
 
+from ..checks.filters.budget import Budget
 from ..checks.filters.checks import check_model, outcomes_of, store
 from ..filters.protocol import check_filter as check_is_filter
 from ..pymc_model.checked_model import checked_model
@@ -171,7 +172,7 @@ def check_filter(
         model,
         filter=filter,
         n_points=check_count("n_draws", n_draws, _LEAST_POINTS),
-        seconds=_SECONDS,
+        budget=Budget(_SECONDS),
         rng=check_random_seed(random_seed),
         progressbar=check_flag("progressbar", progressbar),
     )

@@ -13,7 +13,6 @@ from scipy.special import stdtrit
 
 from ...filters.protocol import Filter
 from ...filters.written import short_form
-from .difference import Difference, difference
 from .estimates import Comparison, Estimates
 from .finding import (
     ALPHA,
@@ -22,8 +21,10 @@ from .finding import (
     TOLERATED,
     UNDECIDED,
     VISIBLE,
+    Difference,
     Finding,
     cure,
+    difference,
     nats,
     scatter_of,
 )

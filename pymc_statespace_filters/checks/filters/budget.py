@@ -23,6 +23,10 @@ class Budget:
         self.counts_compilation = counts_compilation
         self._seconds, self._began = seconds, time.process_time()
 
+    def part(self, n: int) -> "Budget":
+        """One of n equal parts, from now on."""
+        return Budget(self._seconds / n, counts_compilation=self.counts_compilation)
+
     @contextmanager
     def compiling(self) -> Iterator[None]:
         """Compile meanwhile."""

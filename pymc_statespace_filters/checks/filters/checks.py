@@ -75,16 +75,14 @@ def check_model(
     *,
     filter: Filter | None,
     n_points: int,
-    seconds: float,
+    budget: Budget,
     rng: np.random.Generator,
     progressbar: bool = False,
-    counts_compilation: bool = False,
 ) -> pd.DataFrame:
     """Check the filters of all observed StateSpace variables, at draws of the posterior.
 
     They are those of a result, or draws (n, k) of the unconstrained space. ``filter`` is checked in
-    their place; None: their own. ``seconds`` of CPU time are for all variables together, with or
-    without the compilation of other filters.
+    their place; None: their own. All variables have an equal part of the ``budget``.
     """
     nodes = state_space_nodes(model)
     chosen = {
@@ -101,11 +99,11 @@ def check_model(
     rows = []
     for name, one in chosen.items():
         if name in checked:
-            budget = Budget(seconds / len(checked), counts_compilation=counts_compilation)
-            with row_progress(budget, enabled=progressbar) as begin, np.errstate(invalid="ignore"):
+            part = budget.part(len(checked))
+            with row_progress(part, enabled=progressbar) as begin, np.errstate(invalid="ignore"):
                 begin(f"check of {short_form(one)} of {name}", n_points)
                 # Invalid is minus infinity minus itself: failures.
-                findings = _check_variable(model, name, one, x, n_points, budget, rng)
+                findings = _check_variable(model, name, one, x, n_points, part, rng)
         else:
             findings = [_plain_row(one)]
         rows += [{"variable": name, "filter": short_form(one)} | f._asdict() for f in findings]
@@ -122,15 +120,8 @@ def check_at_end(
 ) -> dict[str, dict[str, str]]:
     """The outcomes for all variables, at the end of a calculation that took so many CPU seconds."""
     seconds = max(LEAST_SECONDS * n_points / N_POINTS, _SHARE * seconds)
-    found = check_model(
-        draws,
-        model,
-        filter=filter,
-        n_points=n_points,
-        seconds=seconds,
-        rng=rng,
-        counts_compilation=True,
-    )
+    budget = Budget(seconds, counts_compilation=True)
+    found = check_model(draws, model, filter=filter, n_points=n_points, budget=budget, rng=rng)
     return outcomes_of(found)
 
 

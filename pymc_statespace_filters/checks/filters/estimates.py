@@ -209,19 +209,15 @@ def _candidates(variable: VariableAtPoints, filter: Filter, budget: Budget) -> l
     particles.
     """
     system = compile_system(variable.system)
-    exact = exact_filter(system, without=filter)
-    found: list[Filter] = [] if exact is None else [exact]
+    exact, taken = exact_filter(system, without=filter), filters_for(system)
     number = budget.n_particles(_N_SEEDS * len(variable), variable.n_steps, system.n)
-    taken = filters_for(system)
-    regimes = [one for one in taken if isinstance(one, RBPF) and one.is_exact_for(system)]
-    plain: list[Filter] = [one for one in taken if isinstance(one, BootstrapPF)]
-    if regimes and not isinstance(filter, RBPF):
-        plain = [*regimes]
-    plain = [resized(one, number) for one in plain]
+    kalman = [one for one in taken if isinstance(one, RBPF) and one.is_exact_for(system)]
+    others = [one for one in taken if isinstance(one, BootstrapPF)]
+    plain = [resized(one, number) for one in kalman or others]
     guided = [one for one in taken if isinstance(one, GuidedPF) and not system.jumping_equations]
     if isinstance(filter, GuidedPF):
-        return [*found, *plain, replace(filter, n_particles=_MORE * filter.n_particles)]
-    if is_unbiased(filter):
-        return [*found, *plain, *guided]
-    # Of a part of a record the estimate of guided particles is wrong.
-    return [*found, *([] if variable.leaves_rows_out else guided), *plain]
+        guided = [replace(filter, n_particles=_MORE * filter.n_particles)]
+    elif variable.leaves_rows_out and not is_unbiased(filter):
+        guided = []  # of a part of a record its estimate is wrong
+    noisy: list[Filter] = [*plain, *guided] if is_unbiased(filter) else [*guided, *plain]
+    return noisy if exact is None else [exact, *noisy]

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...filters.written import short_form
-from .difference import difference
 from .e_values import proved_shortfall, visible_shortfall
 from .estimates import Comparison
 from .finding import (
@@ -21,6 +20,7 @@ from .finding import (
     VISIBLE,
     Finding,
     cure,
+    difference,
     nats,
     scatter_of,
 )
@@ -35,14 +35,8 @@ def shortfall(found: Comparison, bounds: NDArray[np.float64]) -> float:
         return -np.inf
     if found.exact is not None:
         return float((found.exact.mean - bounds)[known].max())
-    witnesses = found.unbiased
-    return max(
-        (
-            proved_shortfall(one.logs[known], bounds[known], ALPHA / len(witnesses))
-            for one in witnesses
-        ),
-        default=-np.inf,
-    )
+    alpha = ALPHA / len(found.unbiased)
+    return max(proved_shortfall(one.logs[known], bounds[known], alpha) for one in found.unbiased)
 
 
 def without_likelihood(found: Comparison, check: str, where: str) -> Finding | None:
@@ -51,17 +45,12 @@ def without_likelihood(found: Comparison, check: str, where: str) -> Finding | N
     if not lost.any():
         return None
     name = short_form(found.checked.filter)
+    best = max(found.witnesses, key=lambda one: np.isfinite(one.mean).sum())
     verdict = (
         f"{name} has no likelihood {where}: it is zero at {lost.sum()} of {lost.size} points, and "
-        f"not zero by {_best(found)}. {cure(found)}"
+        f"not zero by {short_form(best.filter)}. {cure(found)}"
     )
     return Finding(check, -np.inf, np.nan, ALPHA, np.inf, OFF, verdict)
-
-
-def _best(found: Comparison) -> str:
-    """The witness that has the highest log-likelihoods."""
-    witnesses = [found.exact] if found.exact else [*found.unbiased]
-    return short_form(max(witnesses, key=lambda one: np.isfinite(one.mean).sum()).filter)
 
 
 def low_at(found: Comparison, where: str) -> Finding:
@@ -92,8 +81,6 @@ def _visible(found: Comparison) -> float:
     known = np.isfinite(found.checked.mean)
     if found.plain is None or not found.plain.is_usable or not known.any():
         return np.inf
-    n_witnesses = len(found.unbiased)
-    seen = visible_shortfall(
-        found.plain.logs[known], found.checked.mean[known], ALPHA / n_witnesses
-    )
+    alpha = ALPHA / len(found.unbiased)
+    seen = visible_shortfall(found.plain.logs[known], found.checked.mean[known], alpha)
     return seen + _N_ERRORS * found.checked.typical_error
