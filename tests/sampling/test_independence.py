@@ -273,6 +273,20 @@ def test_thinned_draws_leave_the_population_its_weight():
     assert shares == pytest.approx([80 / 280, 80 / 100], abs=0.15)
 
 
+def test_many_dimensions_take_more_draws(monkeypatch):
+    """Components of 2000 draws of 25 numbers hardly differ from what they are regularised by."""
+    seen, likeliest, rng = [], proposal_mixture._likeliest, np.random.default_rng(14)
+
+    def noted(parts, rng):
+        seen.append(sum(map(len, parts)))
+        return likeliest(parts, rng)
+
+    monkeypatch.setattr(proposal_mixture, "_likeliest", noted)
+    for dim in (2, 25):
+        fitted_mixture([rng.standard_normal((4000, dim))], rng)
+    assert seen == [2000, 4000]
+
+
 def test_few_or_constant_draws_give_no_mixture():
     rng = np.random.default_rng(11)
     assert fitted_mixture([rng.standard_normal((19, 2))], rng) is None

@@ -42,7 +42,8 @@ LEAST_ACCEPTANCE = 0.05  # of the mixture's proposals, else the share is as smal
 LEAST_WITH_NOISE = 0.01
 MIN_GAIN = 0.02  # nats per held-out draw, to accept a further component
 FEWEST = 10  # different draws for each dimension, to fit at all
-MOST_FITTED = 2000  # draws, more take long
+# Draws, as more take long. In many dimensions components need more, or are hardly their own.
+MOST_FITTED, MOST_PER_DIMENSION = 2000, 200
 
 Array = NDArray[np.float64]
 
@@ -113,7 +114,8 @@ def fitted_mixture(parts: Sequence[Array], rng: np.random.Generator) -> Array | 
 
     None if they are few, or do not vary in every direction.
     """
-    step = -(-sum(map(len, parts)) // MOST_FITTED)
+    most = max(MOST_FITTED, MOST_PER_DIMENSION * parts[0].shape[1])
+    step = -(-sum(map(len, parts)) // most)
     parts = [part[::-step] for part in parts if len(part)]
     draws = np.concatenate(parts)
     dim = draws.shape[1]
