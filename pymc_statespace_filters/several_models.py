@@ -1,6 +1,7 @@
 """`run_models`: the posteriors of several models in one call, by chains or by particles."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import fields
 from functools import partial
@@ -17,6 +18,7 @@ from .facts import tell
 from .former_names import former_names
 from .parallel.signals import keeps_what_is_there, unless_interrupted
 from .parameter_particles import sample_smc
+from .pymc_model.density import check_free_variables
 from .sampling.checkpoint.checkpoint import checked_folder, folder_name
 from .sampling.chosen_sampler import sample, sample_named
 from .sampling.output.facts import WithoutDraws
@@ -145,7 +147,7 @@ def run_models(
 
 
 def _check_models(models: Mapping[str, Model]) -> None:
-    """Raise unless these are models with names."""
+    """Raise unless these are models with names, and all can be sampled."""
     if not isinstance(models, Mapping) or not models:
         raise ModelError(
             f"models must be a non-empty mapping of names to pymc.Model, got {models!r}"
@@ -155,6 +157,19 @@ def _check_models(models: Mapping[str, Model]) -> None:
             raise ModelError(f"names of models must be non-empty strings, got {name!r}")
         if not isinstance(model, Model):
             raise ModelError(f"models[{name!r}] must be a pymc.Model, got {model!r}")
+    for name, model in models.items():
+        with _named(name):
+            check_free_variables(model)
+
+
+@contextmanager
+def _named(name: str) -> Iterator[None]:
+    """Say of an error in which model it is."""
+    try:
+        yield
+    except Exception as error:
+        error.add_note(f"in model {name!r}")
+        raise
 
 
 def _by_particles(name: str, model: Model, **settings: Any) -> DataTree | None:
@@ -182,11 +197,8 @@ def _one_by_one(
         # Each gets the numbers that a generator would give the first.
         own = deepcopy(seed) if isinstance(seed, np.random.Generator) else seed
         changed = {"random_seed": own, "checkpoint": folders.get(name), "comm": comm}
-        try:
+        with _named(name):
             tree = run(name=name, model=model, **{**settings, **changed})
-        except Exception as error:
-            error.add_note(f"in model {name!r}")
-            raise
         if tree is not None:
             found[name] = tree
 

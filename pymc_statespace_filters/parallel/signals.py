@@ -40,7 +40,8 @@ class _Call:
             except KeyboardInterrupt:  # of the former handler, at once
                 if not keeps:
                     raise
-        outer.is_interrupted |= keeps and self.was_interrupted
+        if keeps and self.was_interrupted:
+            outer.is_interrupted = outer.was_interrupted = True
 
     def _handle(self, *signal_and_frame: Any) -> None:
         if self.has_result:

@@ -19,7 +19,7 @@ from pymc.model import Model
 from xarray import DataTree
 
 from ..facts import in_words, tell
-from ..parallel.signals import unless_interrupted
+from ..parallel.signals import is_interrupted, unless_interrupted
 from .choice import DRAM, MOST_THIN, NUTS, Choice, why_not_after_all
 from .output.facts import EndedDram, EndedNuts, EndedRun, Raced, of_model
 from .run.driver import sample_models
@@ -103,7 +103,10 @@ def race(
     raced = Raced(tuple(runs), best, goal)
     if len(runs) > 1:
         tell(raced, begin)
-    tell(replace(best, request=request._replace(tune=best.request.tune)), begin)
+    asked = request._replace(tune=best.request.tune)
+    # After an interrupt nothing is said of the limits that the race had.
+    is_complete = best.is_complete and not is_interrupted()
+    tell(replace(best, request=asked, is_complete=is_complete), begin)
     sampler = NUTS if isinstance(best, EndedNuts) else DRAM
     return best.tree, Choice(sampler, reason or in_words(raced))
 

@@ -113,6 +113,9 @@ def test_of_several_calls_those_are_kept_that_have_ended():
     assert found == [[None, True], []]
     with pytest.raises(KeyboardInterrupt):
         study(lambda: found.append(run(press, keeps=False)))
+    within = keeps_what_is_there(one)  # as chains in a race of samplers in a study
+    study(within, within)
+    assert found == [[None, True], [], [None, True]]
 
 
 @pytest.mark.parametrize("context", [deferred_interrupts, held_interrupts, ignored_interrupts])

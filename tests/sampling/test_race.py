@@ -17,7 +17,9 @@ from pymc_statespace_filters.advice.remedies import reparametrise
 from pymc_statespace_filters.sampling import chosen_sampler, race
 from pymc_statespace_filters.sampling.choice import why_not_after_all
 from pymc_statespace_filters.sampling.nuts.sample_nuts import sample_nuts
+from pymc_statespace_filters.sampling.run import driver
 from pymc_statespace_filters.sampling.run.request import RunArguments
+from tests.interrupts import interrupt
 from tests.sampling.test_nuts_starts import schools
 
 CALL = {"random_seed": 1, "progressbar": False}
@@ -175,3 +177,22 @@ def test_parameters_that_move_together_are_named():
     text = reparametrise(names, x, "gain")
     assert text.startswith("fix one of mass, stiffness and gain, which move together (correl")
     assert reparametrise(names, x, "noise") == "reparametrise noise"
+
+
+@pytest.mark.usefixtures("interrupts_arrive")
+def test_an_interrupted_race_says_nothing_of_the_limits_that_it_had(monkeypatch, caplog):
+    """The first walk is complete and worth too little, and all that follows is interrupted."""
+    n_walks, run_chains = 0, driver.run_chains
+
+    def interrupted(*given, **settings):
+        nonlocal n_walks
+        n_walks += 1
+        if n_walks > 1:
+            interrupt()
+        return run_chains(*given, **settings)
+
+    monkeypatch.setattr(driver, "run_chains", interrupted)
+    idata, said = run(stiff(), caplog, draws=100, tune=100, until_ess=100)
+    assert (n_walks, idata["posterior"].sizes["draw"]) == (2, 100)
+    assert any("400 draws in all are too few" in text for text in said)
+    assert not any("until_ess=100 was not reached" in text for text in said)

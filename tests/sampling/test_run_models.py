@@ -56,6 +56,17 @@ def test_each_model_as_if_alone(models):
         assert_identical(trees[name], sample_dram(model, **SETTINGS))
 
 
+@pytest.mark.parametrize("sampler", ["auto", "smc"])
+def test_no_model_is_sampled_before_all_can_be(sampler, monkeypatch):
+    """The draws of the first would be lost by the error of the second."""
+    with pm.Model() as regimes:
+        pm.Normal("y", pm.Bernoulli("z", 0.5), 1.0, observed=[1.0, 2.0])
+    monkeypatch.setattr(several_models, "_one_by_one", pytest.fail)
+    with pytest.raises(ModelError, match=r"got discrete \['z'\]") as raised:
+        psf.run_models({"easy": normal_model(), "regimes": regimes}, sampler=sampler)
+    assert raised.value.__notes__ == ["in model 'regimes'"]
+
+
 def test_the_dearest_chains_begin(models, monkeypatch):
     order, start = [], ChainPool.start
     monkeypatch.setattr(
