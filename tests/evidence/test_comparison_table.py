@@ -67,6 +67,7 @@ def test_a_warning_is_said_with_its_models():
             "b": evidence(-19, doubts=disagree),
             "c": evidence(-29, se=math.nan, estimator="rough"),
             "d": evidence(-39, noise="held"),
+            "e": evidence(-49, doubts="EKF() is 5 nats low. Use UKF()."),
         }
     )
     warnings = [text for text in said_of if text.startswith("Warning")]
@@ -76,6 +77,7 @@ def test_a_warning_is_said_with_its_models():
         "known.",
         "Warning for 'd' (bridge): the chains held one noise seed, and se excludes the error of "
         "the filter.",
+        "Warning for 'e' (bridge): EKF() is 5 nats low. Use UKF().",
     ]
 
 

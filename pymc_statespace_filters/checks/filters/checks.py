@@ -51,7 +51,7 @@ MORE_POINTS = 40
 def _needs_check(system: Any, filter: Filter) -> bool:
     """Whether the likelihood of a filter may be off for reasons that its noise does not show."""
     compiled = compile_system(system)
-    if isinstance(filter, BootstrapPF) or (
+    if (isinstance(filter, BootstrapPF) and filter.unbiased) or (
         isinstance(filter, RBPF) and filter.is_exact_for(compiled)
     ):
         return False

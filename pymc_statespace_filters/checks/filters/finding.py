@@ -107,11 +107,11 @@ def cure(found: Comparison) -> str:
     if guided is not None and is_of_other_kind and guided.is_usable:
         agrees = plain is None or abs(np.median(guided.mean - plain.mean)) <= TOLERATED
         if agrees and (is_enough is None or _size(is_enough) > _AS_CHEAP * _size(guided.filter)):
-            others = "" if plain is None else " and agree with those of plain particles"
-            return (
-                f"Use {short_form(guided.filter)}: its estimates are unbiased, scatter by "
-                f"{nats(guided.scatter)} nats here{others}."
-            )
+            scatter = f"scatter by {nats(guided.scatter)} nats here"
+            rest = f" and {scatter}"
+            if plain is not None:
+                rest = f", {scatter} and agree with those of plain particles"
+            return f"Use {short_form(guided.filter)}: its estimates are unbiased{rest}."
     if is_enough is not None:
         return f"Use {short_form(is_enough)}, whose estimates are unbiased."
     return (

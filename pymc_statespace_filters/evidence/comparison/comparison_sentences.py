@@ -100,7 +100,7 @@ def _warnings(evidences: Mapping[str, Evidence]) -> Iterator[str]:
         if reasons:
             models.setdefault(f"({evidence.estimator}): {'; '.join(reasons)}", []).append(name)
     for text, names in models.items():
-        yield f"Warning for {_names(names)} {text}."
+        yield f"Warning for {_names(names)} {text.removesuffix('.')}."
 
 
 def _reasons(evidence: Evidence) -> Iterator[str]:

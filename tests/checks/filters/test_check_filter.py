@@ -1,6 +1,8 @@
 """`check_filter` on systems whose likelihood is known: linear ones, and those of one state."""
 
 import json
+from dataclasses import dataclass
+from typing import ClassVar
 
 import arviz as az
 import numpy as np
@@ -57,6 +59,16 @@ def test_exact_and_plain_filters_are_not_compared(monkeypatch):
         assert table["outcome"].tolist() == ["exact"]
         (stored,) = json.loads(idata.attrs["filter_check"]).values()
         assert stored["outcome"] == "exact"
+
+
+def test_a_biased_filter_of_a_user_is_compared_though_its_class_is_one_of_plain_particles():
+    @dataclass(frozen=True)
+    class Biased(psf.BootstrapPF):
+        unbiased: ClassVar[bool] = False
+
+    model = model_of(FREE, Biased(500), record_of(FREE, a=0.8), "a")
+    table = psf.check_filter(draws_of("a"), model, random_seed=1)
+    assert "exact" not in table["outcome"].tolist()
 
 
 def test_an_approximation_of_a_linear_system_differs_by_its_noise_from_kalman():

@@ -149,6 +149,8 @@ def test_guided_particles_alone_decide_if_they_hardly_scatter(scatter, outcomes)
         row, *_ = bias_at_draws(found, draws(), ["a", "b"])
         assert row.outcome == outcome
         assert "GuidedPF(100)" in row.verdict
+        if outcome == OFF:
+            assert "its estimates are unbiased and scatter by" in row.verdict
         assert len(bias_elsewhere(found, found)) == (scatter < 1.0)
 
 
