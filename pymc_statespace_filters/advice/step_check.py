@@ -44,14 +44,15 @@ def step_problems(tree: DataTree, model: Model) -> list[str]:
     if np.median(differences) >= _UNSTABLE:
         return [
             f"{too_long}: a single one multiplies small deviations otherwise than two half as long."
-            " Take LocalLinearization, which follows fast decays with long steps; where the noise "
-            "depends on the state, four times as many substeps until this is no longer said."
+            " Take LocalLinearization, which follows fast decays with long steps, or, where the "
+            "noise depends on the state, multiply substeps by four until this warning is gone."
         ]
     if (shift := _shift(model, _some(draws, _N_DRAWS))) >= _MOST_SHIFT:
         return [
             f"{too_long}: with steps half as long the posterior would move by {shift:.1f} standard "
-            "deviations or more. Take four times as many substeps, or an integrator of higher "
-            "order, until this is no longer said; psf.step_error measures what is left."
+            "deviations or more. Multiply substeps by four until this warning is gone, or take an "
+            "integrator of higher order (ExactLinear for linear equations). psf.step_error "
+            "measures the error of the log-likelihood and of the log-evidence."
         ]
     return []
 
