@@ -20,7 +20,8 @@ from .parallel.signals import keeps_what_is_there, unless_interrupted
 from .parameter_particles import sample_smc
 from .pymc_model.density import check_free_variables
 from .sampling.checkpoint.checkpoint import checked_folder, folder_name
-from .sampling.chosen_sampler import sample, sample_named
+from .sampling.choice import DRAM
+from .sampling.chosen_sampler import request_of, sample, sample_named
 from .sampling.output.facts import WithoutDraws
 from .sampling.run.driver import sample_models
 from .sampling.run.request import RunArguments
@@ -74,7 +75,8 @@ def run_models(
     models : mapping of str to pymc.Model
     sampler : {"auto", "nuts", "dram", "smc"}
         "auto" and "nuts" are those of `sample`, "dram" is `sample_dram`, and "smc" `sample_smc`.
-        With ``comm`` or ``checkpoint`` "auto" is the random walk, as in `sample`.
+        With ``comm``, ``checkpoint`` or ``kernel`` "auto" is the random walk, as in `sample`, whose
+        chains share threads and ranks.
     pilot : xarray.DataTree, or mapping of str to xarray.DataTree, optional
         As in `sample_dram`, of the models with these names. A single one is the pilot of every
         model that has a free variable in common with it. Only with "dram".
@@ -133,11 +135,16 @@ def run_models(
     if checkpoint is not None:
         folder = checked_folder(checkpoint)
         folders = [Path(folder, folder_name(name)) for name in models]
+    if sampler != "dram" and pilot is not None:
+        raise ModelError(
+            f"pilot must be None with sampler={sampler!r}: sampler='dram' starts from one"
+        )
+    of_walk = comm, checkpoint, settings.get("kernel")
+    if sampler == "auto" and any(value is not None for value in of_walk):
+        given = RunArguments(**{"until_ess": AUTO, **settings})
+        requests = [request_of(DRAM, given)] * len(models)
+        return sample_models(models, requests, given.options(comm), folders)
     if sampler != "dram":
-        if pilot is not None:
-            raise ModelError(
-                f"pilot must be None with sampler={sampler!r}: sampler='dram' starts from one"
-            )
         stored_in = dict(zip(models, folders, strict=False))
         run = _by_particles if sampler == "smc" else partial(_by_chains, sampler)
         return _one_by_one(models, run, settings, stored_in, comm)

@@ -164,7 +164,7 @@ def sample_named(
         "comm": comm,
     }
     choice = _choice(model, sampler, only_dram, given)
-    request = _request(choice.sampler, given)
+    request = request_of(choice.sampler, given)
     if continue_from is not None:
         request = _continued(request, continue_from, model)
     level = logging.INFO if given.progressbar else logging.DEBUG
@@ -217,7 +217,8 @@ def _choice(
     return Choice(BOTH, "NUTS follows, from its points, if DRAM takes too many iterations")
 
 
-def _request(sampler: str, given: RunArguments) -> SamplingRequest:
+def request_of(sampler: str, given: RunArguments) -> SamplingRequest:
+    """What `sample` asks of a sampler."""
     until_ess = target_ess(given.until_ess, given.draws, given.chains)
     request = replace(given, until_ess=until_ess).request()
     if until_ess is None:

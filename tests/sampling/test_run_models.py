@@ -12,6 +12,7 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import pytest
+import xarray as xr
 from pytensor.compile.ops import wrap_py
 
 import pymc_statespace_filters as psf
@@ -265,6 +266,25 @@ def test_samplers_and_arguments_of_sample(caplog):
     )
     with pytest.raises(TypeError, match=r"argument 'thin': .* those of sample, without model"):
         psf.run_models(rivals, sampler="auto", thin=2)
+
+
+def test_chains_of_all_models_share_ranks_where_only_the_walk_can_run(
+    models, tmp_path, monkeypatch
+):
+    """The draws are those of `sample`, which takes the walk for each."""
+    calls, sampled = [], several_models.sample_models
+
+    def together(models, *arguments):
+        calls.append(list(models))
+        return sampled(models, *arguments)
+
+    monkeypatch.setattr(several_models, "sample_models", together)
+    settings = {"draws": 100, "tune": 100, "random_seed": 3, "progressbar": False}
+    trees = psf.run_models(models, checkpoint=tmp_path / "all", **settings)
+    assert calls == [list(models)]
+    for name, model in models.items():
+        alone = psf.sample(model=model, checkpoint=tmp_path / name, **settings)
+        xr.testing.assert_equal(trees[name]["posterior"], alone["posterior"])
 
 
 def test_what_particles_do_not_take_is_refused():
