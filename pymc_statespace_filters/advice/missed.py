@@ -10,6 +10,7 @@ from ..parallel.signals import unless_interrupted
 from ..pymc_model.density import ModelDensity
 from ..pymc_model.posterior_draws import (
     MIN_DRAWS,
+    STEP_CHECK,
     are_populations,
     noise_was_moved,
     unconstrained_draws,
@@ -41,14 +42,18 @@ def _(fact: PartsOfPosterior) -> list[str]:
 
 
 def missed_of(fact: EndedRun) -> list[str]:
-    """Say what the draws lack, and whether their integration steps are too long."""
+    """Say what the draws lack, and whether their integration steps are too long.
+
+    Both are stored with the draws.
+    """
     nothing: list[str] = []
     if fact.tree["posterior"].sizes["draw"] < MIN_DRAWS:
         return nothing
-    return [
-        *unless_interrupted(lambda: _missed_parts(fact), nothing),
-        *unless_interrupted(lambda: step_problems(fact.tree, fact.model), nothing),
-    ]
+    missed = unless_interrupted(lambda: _missed_parts(fact), nothing)
+    steps = unless_interrupted(lambda: step_problems(fact.tree, fact.model), nothing)
+    if steps:
+        fact.tree.attrs[STEP_CHECK] = " ".join(steps)
+    return [*missed, *steps]
 
 
 def _missed_parts(fact: EndedRun) -> list[str]:

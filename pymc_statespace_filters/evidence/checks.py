@@ -32,7 +32,7 @@ from scipy.stats import rankdata
 from ..errors import ModelError
 from ..pymc_model.density import RowFunction
 from ..pymc_model.elements import labels_of
-from ..pymc_model.posterior_draws import are_populations
+from ..pymc_model.posterior_draws import STEP_CHECK, are_populations
 from ..pymc_model.step_refinement import densities_by_halvings, step_stability
 from ..statistics.lower_chains import lower_chains
 from .observed_data import scalar_count
@@ -91,6 +91,14 @@ def check_convergence(posterior: Posterior, idata: xr.DataTree | None = None) ->
 def _drawn_by_us(idata: xr.DataTree | None) -> bool:
     """Whether the draws are those of `sample_dram`, which notes whether they are exact."""
     return idata is not None and "refresh_noise" in idata.attrs
+
+
+def check_steps(model: pm.Model, idata: xr.DataTree, draws: Array) -> list[str]:
+    """What is wrong with the integration steps at draws, or was found so when the run ended."""
+    found = list(check_discretisation(model, idata, draws))
+    if not found and (known := idata.attrs.get(STEP_CHECK)):
+        found = [f"{known[0].lower()}{known[1:].rstrip('.')}"]
+    return found
 
 
 def check_discretisation(model: pm.Model, idata: xr.DataTree, draws: Array) -> Iterator[str]:

@@ -24,7 +24,7 @@ from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.posterior_draws import are_populations, noise_was_moved, posterior_group
 from ..pymc_model.prior import Support
 from .agreement import chosen_estimator
-from .checks import check_convergence, check_discretisation
+from .checks import check_convergence, check_steps
 from .estimators.importance import Importance
 from .estimators.largest_likelihood import N_EVALUATIONS, max_log_likelihood
 from .estimators.protocol import Estimate, Estimator
@@ -98,7 +98,7 @@ def run_estimators(
     parts = PartsOfPosterior(idata, model, posterior, stream(UNVISITED), is_sorted)
     common = (
         *support.check(),
-        *check_discretisation(model, idata, posterior.draws),
+        *check_steps(model, idata, posterior.draws),
         *(sentences(FiltersOfDraws(idata, model)) if exact is None else ()),
         *check_convergence(posterior, idata),
         # Draws that miss orders of labels miss modes as well, which is said once.

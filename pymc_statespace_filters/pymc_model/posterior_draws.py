@@ -20,6 +20,7 @@ from ..errors import DataMismatchError, ModelError
 
 MIN_DRAWS = 20
 STATES = "sampler_state"  # the group of the last states of chains
+STEP_CHECK = "step_check"  # attribute: what the end of a run says of integration steps
 # Values of the attribute ``sampler`` of draws.
 BY_PARTICLES = "smc"  # their filter may not be that of the model
 COURSE = "smc"  # group with the course of their run

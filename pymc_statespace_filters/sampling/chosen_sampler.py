@@ -26,7 +26,7 @@ from .run.request import RunArguments, SamplingRequest
 from .run.stopping import AUTO, target_ess
 
 _SAMPLERS = ("auto", NUTS, DRAM)
-_NAMES = {DRAM: "DRAM", NUTS: "NUTS", BOTH: "DRAM first"}
+_NAMES = {DRAM: "DRAM", NUTS: "NUTS", BOTH: "DRAM, then NUTS"}
 # CPU seconds of each processor, within which chains go on to reach ``until_ess``.
 TIME_LIMIT = 300.0
 
@@ -214,7 +214,7 @@ def _choice(
     reason = why_dram(model)
     if reason:
         return Choice(DRAM, reason)
-    return Choice(BOTH, "NUTS follows, from its points, if DRAM takes too many iterations")
+    return Choice(BOTH, "NUTS runs only if DRAM takes too many iterations")
 
 
 def request_of(sampler: str, given: RunArguments) -> SamplingRequest:

@@ -1,6 +1,7 @@
 """Steps too long for the equations are named at the end of a run, and others are not."""
 
 import logging
+import warnings
 
 import numpy as np
 import pymc as pm
@@ -9,6 +10,7 @@ import xarray as xr
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.advice.step_check import step_problems
+from pymc_statespace_filters.errors import EvidenceWarning
 
 
 def decay(dt, integrator=psf.EulerMaruyama, **options):
@@ -38,12 +40,19 @@ def record():
     ids=["long", "substeps", "exact"],
 )
 def test_steps_too_long_are_named(record, system, is_named, caplog):
-    with pm.Model(), caplog.at_level(logging.WARNING, "pymc"):
+    with pm.Model() as model, caplog.at_level(logging.WARNING, "pymc"):
         pm.HalfNormal("k", 4.0)
         pm.HalfNormal("s", 4.0)
         psf.StateSpace("d", system, psf.EKF(), steps=range(1, 101), observed=record["observations"])
-        psf.sample(500, sampler="dram", random_seed=1, progressbar=False)
+        idata = psf.sample(500, sampler="dram", random_seed=1, progressbar=False)
     assert ("steps half as long the posterior would move" in caplog.text) == is_named
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", EvidenceWarning)
+        found = psf.estimate_evidence(idata, model, random_seed=1, progressbar=False)
+    doubt = "the integration steps of 0.5 are too long"
+    assert (doubt in found["bridge"].doubts) == is_named
+    assert any(doubt in str(one.message) for one in caught) == is_named
+    assert psf.compare_evidence({"it": idata, "other": idata})["warning"].all() == is_named
 
 
 def test_a_run_of_few_draws_is_not_looked_at(record):
