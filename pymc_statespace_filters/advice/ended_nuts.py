@@ -53,10 +53,11 @@ def _too_short(fact: EndedNuts, instead: str) -> list[str]:
 
 def _report(fact: EndedNuts) -> str:
     n_chains, n_draws = fact.diverging.shape
+    chains = "1 chain" if n_chains == 1 else f"{n_chains} chains"
     behind = "" if fact.length.thin == 1 else f", each the last of {fact.length.thin}"
     found = "" if fact.convergence is None else f"; {fact.convergence.described(fact.names)}"
     return (
-        f"{n_chains} chains of {n_draws} draws{behind}, after a warm-up of {fact.request.tune}"
+        f"{chains} of {n_draws} draws{behind}, after a warm-up of {fact.request.tune}"
         f"{found}. A draw took {fact.n_steps.mean():.0f} gradients; E-BFMI is at least "
         f"{_e_bfmi(fact).min():.2f}."
     )

@@ -65,7 +65,13 @@ def nearest_steps(times: Any, dt: float, *, t0: Any = 0.0, unit: Any = None) -> 
 
 def check_steps(steps: Any) -> np.ndarray:
     """Integer steps, not negative, strictly increasing."""
-    array = np.asarray(steps)
+    try:
+        array = np.asarray(steps)
+    except ValueError:
+        raise ModelError(
+            f"steps must be a vector of integers, got lists of several lengths, {shortened(steps)}:"
+            " records side by side need panel="
+        ) from None
     if array.size == 0:
         raise ModelError(f"steps must hold at least one step, got {shortened(steps)}")
     if array.ndim == 1 and _holds_large_integers(array):

@@ -192,6 +192,7 @@ def test_times_in_place_of_steps():
         ({"observed": pt.dvector("v")}, "observed must have 2 dimensions .*symbolic"),
         ({"steps": STEPS * 1.0}, r"steps must be a vector of integers.*\.astype\(int\)"),
         ({"steps": pytensor.shared(STEPS * 1.0)}, "steps must be a vector of integers"),
+        ({"steps": [[1, 2], [1, 2, 3]]}, "lists of several lengths.*need panel="),
         ({"steps": [0, 2, 2, 6]}, r"got steps\[1\] = 2 followed by 2"),
         ({"steps": None, "times": pt.dvector("t")}, "times must be numbers, got a symbol"),
         ({"inputs": pytensor.shared(FORCE[:5])}, "inputs must have at least 6 rows.*got 5"),

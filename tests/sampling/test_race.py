@@ -196,3 +196,8 @@ def test_an_interrupted_race_says_nothing_of_the_limits_that_it_had(monkeypatch,
     assert (n_walks, idata["posterior"].sizes["draw"]) == (2, 100)
     assert any("400 draws in all are too few" in text for text in said)
     assert not any("until_ess=100 was not reached" in text for text in said)
+
+
+def test_one_chain_of_nuts_is_one(caplog):
+    _, said = run(schools(centred=False), caplog, draws=20, tune=20, chains=1, sampler="nuts")
+    assert any(text.startswith("1 chain of 20 draws") for text in said)
