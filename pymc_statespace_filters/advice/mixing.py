@@ -67,10 +67,11 @@ def _remedy(fact: EndedRun, enough: float, ways: Sequence[str]) -> str:
     more = "make more with psf.sample(continue_from=idata)"
     if not fact.goes_on:
         more = "draw more with psf.sample(draws=..., until_ess=None), which has no limit of time"
-    return (
-        f"{would_do}the run ended as twice as many would take longer than it may: "
-        f"{alternatives([more, *ways])}"
-    )
+    # A race ends for what its samplers take in all; what chains take is at most their seconds.
+    ended = "the run ended as twice as many would take longer than it may: "
+    if 2.0 * request.chains * fact.seconds < request.seconds:
+        ended = ""
+    return f"{would_do}{ended}{alternatives([more, *ways])}"
 
 
 def _needed(fact: EndedRun, found: Convergence, enough: float) -> str:

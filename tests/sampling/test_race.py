@@ -201,3 +201,12 @@ def test_an_interrupted_race_says_nothing_of_the_limits_that_it_had(monkeypatch,
 def test_one_chain_of_nuts_is_one(caplog):
     _, said = run(schools(centred=False), caplog, draws=20, tune=20, chains=1, sampler="nuts")
     assert any(text.startswith("1 chain of 20 draws") for text in said)
+
+
+def test_a_race_that_nobody_wins_does_not_say_that_it_took_too_long(caplog):
+    """NUTS diverges in the neck of a funnel, and the walks after it are bounded by their number."""
+    with pm.Model() as model:
+        pm.Normal("x", 0, pm.math.exp(pm.Normal("v", 0, 3) / 2), shape=9)
+    _, said = run(model, caplog, draws=200)
+    (text,) = [text for text in said if "until_ess=400 was not reached" in text]
+    assert "longer than it may" not in text
