@@ -24,6 +24,7 @@ ATTRIBUTE = "unvisited"  # of results, a JSON text
 N_SHOWN = 4  # elements of a point
 MOST_DRAWS = 20_000  # that are looked at
 N_TIMED, N_PARTS = 40, 3  # evaluations whose time is measured; a pause may fall into one part
+N_FAR = 10  # the same, at points of the prior
 
 Array = NDArray[np.float64]
 
@@ -55,6 +56,9 @@ def unvisited(
     ]
     if prior is not None:
         shapes = [at.shape for at in places_in_vector(model).values()]
+        # A grid, for example, has more points where the noise is small.
+        far = _seconds_of_each(evaluate, prior[:: -(-len(prior) // N_FAR)], rng)
+        n_evaluations = seconds / max(each, far, 1e-7)
         copy = missed_copy(draws, log_density, prior, shapes, evaluate, n_evaluations, rng)
         if copy is not None:  # a tail that leads there is a part of the same
             return [_sentence_of_copy(model, copy)]

@@ -119,3 +119,27 @@ def test_a_pause_while_the_time_is_measured_does_not_end_the_check(monkeypatch):
         np.random.default_rng(1),
     )
     assert sum(calls) > 100
+
+
+def test_points_far_from_the_draws_may_take_longer(monkeypatch):
+    """As by a grid; the lines on which copies are looked for are as wide as the prior."""
+    clock = [0.0]
+    monkeypatch.setattr(sentences.time, "process_time", lambda: clock[0])
+
+    def evaluate(x, rng):
+        clock[0] += np.where(np.abs(x[:, 0]) < 20.0, 1e-4, 0.1).sum()
+        return -0.5 * x[:, 0] ** 2
+
+    rng = np.random.default_rng(1)
+    draws = rng.standard_normal((4, N, 1))
+    prior = 100.0 * rng.standard_normal((2000, 1))
+    unvisited(
+        model_of(lambda: pm.Normal("a")),
+        draws,
+        -0.5 * draws[..., 0] ** 2,
+        evaluate,
+        2.0,
+        rng,
+        prior,
+    )
+    assert 0.0 < clock[0] < 6.0
