@@ -102,6 +102,17 @@ def test_all_is_legible_in_80_columns(progressbar, monkeypatch):
     assert "draws/s" in drawn
 
 
+def test_a_sampler_without_a_rate_shows_none():
+    """As NUTS, which says how many draws have diverged."""
+    bars = ChainProgress(2, DRAWS, TUNE, has_rate=False)
+    screen = quiet(bars, width=80)
+    with bars:
+        bars.update(0, TUNE + DRAWS, {"n_failed": 17})
+    drawn = screen.getvalue()
+    assert drawn.split()[:3] == ["Progress", "Draw", "Fails"]
+    assert "17" in drawn
+
+
 def test_values_are_legible_in_80_columns_in_the_bar_of_pm_sample():
     with pm.Model():
         pm.Normal("x")

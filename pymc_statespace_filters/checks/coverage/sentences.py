@@ -90,7 +90,7 @@ def _sentence(model: pm.Model, missed: MissedTail) -> str:
         f"{missed.draws:.1%} of the draws lie there, and at least {missed.posterior:.1%} of the "
         f"posterior ({missed.errors:.1f} standard errors more), so that means, intervals and the "
         "evidence lack it; reparametrise the model there (a non-centred form of a hierarchical "
-        "one), or draw longer chains with smaller steps"
+        "one), or draw longer chains"
     )
 
 

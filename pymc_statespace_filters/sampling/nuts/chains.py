@@ -96,7 +96,8 @@ def run_nuts(
     )
     began = time.monotonic(), time.process_time()
     interrupts_are_noted()
-    with ChainProgress(request.chains, request.draws, request.tune, progressbar) as bars:
+    size = request.chains, request.draws, request.tune
+    with ChainProgress(*size, progressbar, has_rate=False) as bars:
         sampler = nutpie.sample(
             model,
             draws=request.max_draws or request.draws,
@@ -183,7 +184,7 @@ def _is_finished(sampler: Any) -> bool:
 
 
 def _shown(chain: Any) -> dict[str, float]:
-    return {"accept_rate": np.nan, "n_failed": chain.divergences}
+    return {"n_failed": chain.divergences}
 
 
 def _is_stuck(

@@ -23,11 +23,11 @@ def step_columns(n_chains: int) -> tuple[list[ProgressColumn], dict[str, list]]:
 
 def stat_values(stats: Mapping[str, Any]) -> dict[str, Any]:
     """What columns show of a draw's statistics, and whether the bar turns red."""
-    return {
-        "accept_rate": stats["accept_rate"],
-        "failed": stats["n_failed"],
-        "failing": stats["accept_rate"] < MIN_ACCEPT_RATE,
-    }
+    shown = {"failed": stats["n_failed"]}
+    if "accept_rate" in stats:
+        rate = stats["accept_rate"]
+        shown |= {"accept_rate": rate, "failing": rate < MIN_ACCEPT_RATE}
+    return shown
 
 
 def _column(key: str, title: str, form: str) -> ProgressColumn:
@@ -45,6 +45,8 @@ class ChainProgress(ProgressBarManager):
     n_chains, draws, tune : int
     progressbar : bool or str
         As in ``pm.sample``: True, False, "combined", "split", "combined+stats", "split+stats".
+    has_rate : bool
+        Whether a fraction of accepted proposals is known.
 
     Raises
     ------
@@ -60,14 +62,22 @@ class ChainProgress(ProgressBarManager):
 
     step_name = "Draw"
 
-    def __init__(self, n_chains: int, draws: int, tune: int, progressbar: Any = True):
+    def __init__(
+        self,
+        n_chains: int,
+        draws: int,
+        tune: int,
+        progressbar: Any = True,
+        *,
+        has_rate: bool = True,
+    ):
         super().__init__(n_chains, progressbar)
         chains_per_bar = n_chains if self.combined_progress else 1
         self._tune = chains_per_bar * tune
         self._totals = [draws + tune] * n_chains
         self._done = [0] * n_chains
         self._convergence: dict[int, tuple[float, float]] = {}
-        columns, stats = step_columns(n_chains)
+        columns, stats = step_columns(n_chains) if has_rate else ([], {})
         columns.append(_column("failed", "Fails", "d"))
         stats |= {"failed": [0] * n_chains, "draw": [0] * n_chains}
         stats["marker_pos"] = [self._tune] * n_chains
@@ -93,7 +103,7 @@ class ChainProgress(ProgressBarManager):
         done : int
             Its iterations so far, warm-up included. Nothing is drawn if there are no new ones.
         stats : mapping of str to number
-            "accept_rate" and "n_failed" of its last draw, as in ``sample_stats``.
+            "n_failed" of its last draw and, if it is known, "accept_rate", as in ``sample_stats``.
         seconds : float, optional
             How long the chain has run, once it has ended: PyMC's bar has no speed for what took
             less than a quarter of a second.
