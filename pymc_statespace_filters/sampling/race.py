@@ -3,8 +3,8 @@
 The random walk runs first, as it needs no gradient: short at first, then longer and longer, each
 time with proposals made of the draws of the time before. Where it would take more than the first
 run of NUTS, NUTS starts at its points, in coordinates made of them. It ends where it is seen to
-take more than the walk; then, or where it diverges, the walk goes on from the draws of NUTS, for at
-most as long as all has taken before.
+take more than the walk; then, or where it diverges, the walk goes on from the points that are worth
+most, for at most as long as all has taken before.
 
 What a sampler takes is counted in evaluations, not in seconds, so that the outcome depends on no
 clock: a seed gives the same draws on an idle machine and on a busy one.

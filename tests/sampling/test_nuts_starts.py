@@ -111,7 +111,7 @@ def schools(*, centred):
 def test_a_funnel_ends_the_run_at_the_first_doubling_that_does_not_help(caplog):
     tree = psf.sample(250, tune=500, model=schools(centred=True), **CALL)
 
-    assert 2 <= tree.attrs["iterations_per_draw"] <= 8  # of 64
+    assert 2 <= tree.attrs["iterations_per_draw"] <= 32  # of 64
     assert "draws diverged, most where tau is small" in caplog.text
     assert "More iterations do not help draws that diverge: reparametrise tau" in caplog.text
     assert "would do" not in caplog.text  # no number of iterations does

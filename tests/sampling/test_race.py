@@ -161,7 +161,7 @@ def test_nuts_ends_where_it_takes_more_than_it_may(most):
     (nuts,) = runs
     assert nuts.is_beaten == (most < np.inf)
     assert (nuts.n_gradients > most) == nuts.is_beaten
-    assert (len(nuts.positions) == 0) == (most == 500.0)
+    assert (nuts.convergence is None) == nuts.is_beaten  # so that no walk starts from its draws
 
 
 def test_no_words_name_a_sampler_as_a_remedy():

@@ -169,10 +169,10 @@ def _followed(
     kept = _kept(trace, length, found, seconds)
     kept = kept._replace(is_stuck=is_stuck, is_beaten=is_beaten)
     made = kept.positions.shape[1]
+    if is_beaten:  # how many draws there are depends on when it was seen
+        return kept._replace(found=None)
     if made == length.draws:
         return kept
-    if is_beaten:  # before its draws were looked at
-        return kept._replace(found=None)
     found = convergence(list(kept.positions))
     return kept._replace(length=length._replace(draws=made), found=found, is_complete=False)
 
