@@ -47,13 +47,16 @@ def _set_up_kernels(profiles: Path) -> None:
     """Have kernels write errors only, and collect garbage less often.
 
     Each warns that it is reached by TCP, the default. Compilation makes millions of objects that
-    stay, which the collector would visit over and over.
+    stay, which the collector would visit over and over. What is said where it takes seconds would
+    depend on the machine.
     """
     config = profiles / "profile_default" / "ipython_kernel_config.py"
     config.parent.mkdir(parents=True, exist_ok=True)
     config.write_text(
         "import gc\n"
+        "from pymc_statespace_filters import progress\n"
         "gc.set_threshold(50_000, 20, 10)\n"
+        "progress.PATIENCE = 3600.0\n"
         'get_config().IPKernelApp.log_level = "ERROR"\n',
         encoding="utf-8",
     )
