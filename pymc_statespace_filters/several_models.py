@@ -20,7 +20,7 @@ from .parallel.signals import keeps_what_is_there, unless_interrupted
 from .parameter_particles import sample_smc
 from .pymc_model.density import check_free_variables
 from .sampling.checkpoint.checkpoint import checked_folder, folder_name
-from .sampling.choice import DRAM
+from .sampling.choice import DRAM, what_nuts_lacks
 from .sampling.chosen_sampler import request_of, sample, sample_named
 from .sampling.output.facts import WithoutDraws
 from .sampling.run.driver import sample_models
@@ -139,11 +139,14 @@ def run_models(
         raise ModelError(
             f"pilot must be None with sampler={sampler!r}: sampler='dram' starts from one"
         )
-    of_walk = comm, checkpoint, settings.get("kernel")
-    if sampler == "auto" and any(value is not None for value in of_walk):
+    of_walk = {"kernel": settings.get("kernel"), "checkpoint": checkpoint, "comm": comm}
+    if sampler == "auto" and (reason := what_nuts_lacks(of_walk)):
         given = RunArguments(**{"until_ess": AUTO, **settings})
         requests = [request_of(DRAM, given)] * len(models)
-        return sample_models(models, requests, given.options(comm), folders)
+        trees = sample_models(models, requests, given.options(comm), folders)
+        for tree in (trees or {}).values():
+            tree.attrs |= {"sampler": DRAM, "sampler_reason": reason}
+        return trees
     if sampler != "dram":
         stored_in = dict(zip(models, folders, strict=False))
         run = _by_particles if sampler == "smc" else partial(_by_chains, sampler)

@@ -83,7 +83,7 @@ def _check(fact: UsedFilters) -> FilterCheck:
     except StateSpaceFiltersError as error:
         return FilterCheck((f"The filter was not checked: {error}",))
     store(tree, outcomes)
-    longer = {UNDECIDED: "; psf.check_filter(idata, model) takes the time for it"}
+    longer = {UNDECIDED: "; psf.check_filter(idata, model) takes longer and may decide"}
     said = [
         f"{name}: {one['verdict']}{longer.get(one['outcome'], '')}"
         for name, one in outcomes.items()

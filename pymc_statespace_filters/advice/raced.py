@@ -13,7 +13,11 @@ def _(fact: Raced) -> list[str]:
     for i, run in enumerate(fact.runs):
         # Of walks, each from the points of the one before, the last one is named.
         if run is fact.best or kinds[i] or kinds[i + 1 : i + 2] != [False]:
-            name = "DRAM, from the better points," if any(kinds[:i]) else _first_name(run, fact)
+            name = (
+                "DRAM, restarted from the better points,"
+                if any(kinds[:i])
+                else _first_name(run, fact)
+            )
             said.append(f"{name} {_outcome(run, fact)}")
     return ["; ".join(said)]
 
@@ -28,8 +32,8 @@ def _(fact: Raced, begin: str) -> list[str]:
 def _first_name(run: EndedRun, fact: Raced) -> str:
     """The name of a run before which no NUTS has run."""
     if isinstance(run, EndedNuts):
-        return "NUTS, from its points,"
-    return "DRAM" if run is fact.runs[0] else "DRAM, from points of its own,"
+        return "NUTS, started from its points,"
+    return "DRAM" if run is fact.runs[0] else "DRAM, restarted from its own points,"
 
 
 def _outcome(run: EndedRun, fact: Raced) -> str:
@@ -40,6 +44,6 @@ def _outcome(run: EndedRun, fact: Raced) -> str:
         return f"diverged in {run.diverging.mean():.1%} of its draws"
     if not isinstance(run, EndedNuts) and run is not fact.best:
         needed = rounded(expected_iterations(run.request, run.length, found))
-        return f"would take some {needed} iterations of each chain for draws worth {fact.goal:g}"
+        return f"needs some {needed} iterations of each chain for {fact.goal:g} effective draws"
     worth = 0.0 if found is None else found.least_ess
-    return f"made draws worth {worth:.0f} with {n} iterations of each chain"
+    return f"gave {worth:.0f} effective draws in {n} iterations of each chain"

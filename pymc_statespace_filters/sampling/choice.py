@@ -1,6 +1,7 @@
 """Which samplers a model allows: the random walk of `sample_dram`, or NUTS too."""
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import pytensor
 from pymc.model import Model
@@ -18,6 +19,12 @@ class Choice(NamedTuple):
 
     sampler: str
     reason: str
+
+
+def what_nuts_lacks(arguments: Mapping[str, Any]) -> str:
+    """The first of these arguments that is given, which the random walk alone has, as a reason."""
+    given = [name for name, value in arguments.items() if value is not None]
+    return f"NUTS has no {given[0]}" if given else ""
 
 
 def why_dram(model: Model) -> str:

@@ -16,7 +16,7 @@ from ..parallel.signals import keeps_what_is_there
 from ..pymc_model.density import check_free_variables
 from ..pymc_model.inspection import given_model
 from .checkpoint.checkpoint import checked_folder
-from .choice import BOTH, DRAM, MOST_THIN, NUTS, Choice, why_dram, why_no_nuts
+from .choice import BOTH, DRAM, MOST_THIN, NUTS, Choice, what_nuts_lacks, why_dram, why_no_nuts
 from .output.convergence import FEWEST
 from .output.facts import of_model
 from .race import race
@@ -205,8 +205,8 @@ def _choice(
             raise ModelError("tune must be at least 1 with sampler='nuts', got 0")
     if sampler != "auto":
         return Choice(sampler, f"sampler={sampler!r}")
-    if asked:
-        return Choice(DRAM, f"NUTS has no {asked[0]}")
+    if reason := what_nuts_lacks(only_dram):
+        return Choice(DRAM, reason)
     if given.tune == 0:
         return Choice(DRAM, "NUTS needs a warm-up, and tune is 0")
     if given.draws < FEWEST:

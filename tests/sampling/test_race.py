@@ -81,8 +81,8 @@ def walks(monkeypatch):
 def test_a_walk_that_is_quick_is_not_raced(caplog):
     idata, said = run(schools(centred=False), caplog)
     assert idata.attrs["sampler"] == "dram"
-    assert idata.attrs["sampler_reason"].startswith("DRAM made draws worth")
-    assert not any("NUTS, from its points" in text for text in said)
+    assert idata.attrs["sampler_reason"].startswith("DRAM gave")
+    assert not any("NUTS, started from its points" in text for text in said)
 
 
 def test_a_walk_goes_on_longer_from_its_own_points(caplog, walks, monkeypatch):
@@ -90,8 +90,8 @@ def test_a_walk_goes_on_longer_from_its_own_points(caplog, walks, monkeypatch):
     monkeypatch.setattr(race, "_FIRST", 1)
     idata, said = run(schools(centred=True), caplog)
     assert idata.attrs["sampler"] == "dram"
-    assert idata.attrs["sampler_reason"].startswith("DRAM, from points of its own, made draws")
-    assert not any("NUTS, from its points" in text for text in said)
+    assert idata.attrs["sampler_reason"].startswith("DRAM, restarted from its own points, gave")
+    assert not any("NUTS, started from its points" in text for text in said)
     assert [walk.max_draws for walk in walks] == [1000 * 4**i for i in range(len(walks))]
     assert len({tuple(walk.entropy) for walk in walks}) == len(walks) > 1
     assert walks[0].pilot is None
@@ -102,8 +102,10 @@ def test_what_a_race_takes_is_bounded(caplog, walks):
     """Draws that are never worth enough: the walks at the end take no more than all before them."""
     call = {"draws": 20, "tune": 40, "chains": 2, "until_ess": 40.0}
     _, said = run(schools(centred=False), caplog, **call)
-    (told,) = (text for text in said if text.startswith("DRAM, from points of its own, would take"))
-    assert "DRAM, from the better points," in told
+    (told,) = (
+        text for text in said if text.startswith("DRAM, restarted from its own points, needs")
+    )
+    assert "DRAM, restarted from the better points," in told
     made = [walk.max_draws // 20 for walk in walks]
     assert made[:4] == [4, 16, 64, 256]
     most = 340 * (1 + race._MOST_SPENT) + 2000  # which NUTS makes before it is looked at
@@ -112,7 +114,7 @@ def test_what_a_race_takes_is_bounded(caplog, walks):
 
 def test_nuts_from_the_points_of_a_slow_walk(caplog, nuts_follows):
     idata, said = run(stiff(), caplog, draws=250)
-    (told,) = (text for text in said if "NUTS, from its points, made draws worth" in text)
+    (told,) = (text for text in said if "NUTS, started from its points, gave" in text)
     assert idata.attrs["sampler_reason"] == told.removesuffix(".")
     assert not any("until_ess" in text for text in said)  # what the other lacks nobody needs
 
@@ -130,8 +132,8 @@ def test_no_clock_decides(request, caplog, nuts_follows, monkeypatch):
 def test_the_walk_goes_on_where_nuts_diverges(caplog, nuts_follows):
     """At a neck, from the draws of NUTS; each has been tried, so no message sends to the other."""
     idata, said = run(schools(centred=True), caplog)
-    (told,) = (text for text in said if "DRAM, from the better points," in text)
-    assert "NUTS, from its points, diverged in" in told
+    (told,) = (text for text in said if "DRAM, restarted from the better points," in text)
+    assert "NUTS, started from its points, diverged in" in told
     assert idata.attrs["sampler_reason"] == told.removesuffix(".")
     assert idata.attrs["sampler"] in told.lower()
     assert not any("sampler=" in text or "psf.sample" in text for text in said)
@@ -146,8 +148,8 @@ def test_the_walk_goes_on_from_its_own_points_where_nuts_cannot_follow(caplog, n
     idata, said = run(staircase(), caplog, draws=250)
     assert idata.attrs["sampler"] == "dram"
     assert idata.attrs["sampler_reason"] == "the likelihood is a staircase of year"
-    assert any(text.startswith("DRAM, from points of its own, made draws worth") for text in said)
-    assert not any("NUTS, from its points, " in text for text in said[1:])
+    assert any(text.startswith("DRAM, restarted from its own points, gave") for text in said)
+    assert not any("NUTS, started from its points, " in text for text in said[1:])
 
 
 @pytest.mark.parametrize("most", [500.0, 3000.0, np.inf])

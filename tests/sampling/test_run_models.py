@@ -285,6 +285,7 @@ def test_chains_of_all_models_share_ranks_where_only_the_walk_can_run(
     for name, model in models.items():
         alone = psf.sample(model=model, checkpoint=tmp_path / name, **settings)
         xr.testing.assert_equal(trees[name]["posterior"], alone["posterior"])
+        assert trees[name].attrs["sampler_reason"] == alone.attrs["sampler_reason"]
 
 
 def test_what_particles_do_not_take_is_refused():
