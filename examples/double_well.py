@@ -116,6 +116,7 @@ def study(args: argparse.Namespace) -> str:
         sampler="dram",
         draws=args.draws,
         tune=args.tune,
+        until_ess=400,
         chains=args.chains,
         random_seed=args.seed,
         progressbar=args.progressbar,
