@@ -78,11 +78,13 @@ def bias_at_draws(found: Comparison, x: Array, names: Sequence[str]) -> list[Fin
             f"between draws{moves}. {cure(found)}"
         )
     elif visible <= VISIBLE and most <= VISIBLE:
-        outcome = FINE
+        outcome, place = FINE, f"{size} {side}"
+        begin = f"no sign that {name} is off: it is {place} {other} at draws, and"
+        if visible <= TOLERATED and most <= _TOLERATED_SHIFT:
+            begin = f"{name} is close to {other}: {place} it at draws;"
         verdict = (
-            f"{name} is close to {other}: {size} {side} it at draws; {moves} if the filter were "
-            f"exact (a warning begins where more than {TOLERATED:g} nat or {_TOLERATED_SHIFT:g} sd "
-            "are certain)"
+            f"{begin} {moves} if the filter were exact (a warning begins where more than "
+            f"{TOLERATED:g} nat or {_TOLERATED_SHIFT:g} sd are certain)"
         )
     else:
         outcome = UNDECIDED

@@ -72,6 +72,20 @@ def test_guided_filters_that_are_right_are_rarely_found_low(collapsed):
     assert (found.count(UNDECIDED) > 150) == collapsed
 
 
+@pytest.mark.parametrize(
+    ("spread", "begin"),
+    [(0.05, "EKF() is close to GridFilter(): "), (0.8, "no sign that EKF() is off: it is ")],
+)
+def test_a_filter_is_close_where_no_parameter_can_move_far(spread, begin):
+    """A standard deviation of the difference bounds every shift."""
+    lost = spread * np.random.default_rng(5).standard_normal(20)
+    found = compared(exactly(psf.EKF(), lost), exactly(psf.GridFilter(), 0.0), None)
+    row, *_ = bias_at_draws(found, draws(), ["a", "b"])
+    assert row.outcome == FINE
+    assert row.verdict.startswith(begin)
+    assert "no parameter would move by more than" in row.verdict
+
+
 def test_the_mean_difference_and_the_shift_of_a_parameter():
     at = draws(200)
     bias = -4.0 + 1.5 * at[:, 0]
