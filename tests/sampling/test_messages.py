@@ -37,6 +37,10 @@ def run_chains(**arguments):
     )
 
 
+def by_nuts(**arguments):
+    return psf.sample(sampler="nuts", model=simple_model(), progressbar=False, **arguments)
+
+
 def run_in_model(**arguments):
     return psf.sample_dram(**with_kernel(arguments))
 
@@ -124,7 +128,13 @@ TABLE = [
     (run_chains, {"initvals": {"nu": 1.0}}, "free variables of the model, mu, sigma, got 'nu'"),
     (run_chains, {"initvals": {"mu": [1.0, 2.0]}}, r"'mu' must have shape \(\), got \(2,\)"),
     (run_chains, {"initvals": {"mu": "x"}}, r"'mu' must be numbers, .* got 'x'"),
-    (run_chains, {"initvals": {"sigma": -1.0}}, r"not finite at the start, \[0\.0, nan\]"),
+    *(
+        (call, {"initvals": values}, r"'sigma' .* HalfNormal prior, \(0, inf\), got -1\.0$")
+        for call, values in (
+            (run_chains, [{"sigma": 1.0}, {"sigma": -1.0}]),
+            (by_nuts, {"sigma": -1.0}),
+        )
+    ),
     (run_chains, {"stages": 0}, r"stages must be .* got 0"),
     (run_chains, {"model": 3}, r"model must be a pymc.Model, got int"),
     (run_chains, {"checkpoint": 3}, r"checkpoint must be the path of a folder, got 3"),

@@ -19,7 +19,7 @@ from ..output.facts import EndedNuts, SeparateModes, of_model
 from ..run.request import ExecutionOptions, SamplingRequest
 from ..starts.local_scale import local_cov
 from ..starts.population import find_population
-from ..target.initial_points import check_initvals
+from ..target.initial_points import check_in_support, check_initvals
 from ..target.settings import RandomWalkSettings
 from ..target.target import Target
 from ..target.variables import check_no_generators
@@ -148,8 +148,9 @@ def _starts(
         population = find_population(target, rng, progressbar=bool(options.progressbar))
         tell(SeparateModes(model, target.raveled, population, before_run=True), begin)
         return population.x, frame_of(population.x, evaluate)
-    point = make_initial_point_fn(model=model, overrides=dict(initvals or {}))
-    centre = target.raveled.ravel(point(0))
+    start = make_initial_point_fn(model=model, overrides=dict(initvals or {}))(0)
+    check_in_support(model, start, initvals)
+    centre = target.raveled.ravel(start)
     frame, width = Frame(centre, np.eye(centre.size)), 1.0
     if initvals:
         if (cov := local_cov(target, centre)) is None:

@@ -16,6 +16,7 @@ from pytensor.graph.basic import Variable
 
 from ...errors import ModelError
 from ...filters.outcomes import Failure
+from ...pymc_model.ends_of_support import ends_of_support
 from .variables import RaveledVariables
 
 N_DRAWS = 200
@@ -179,10 +180,12 @@ def chain_candidates(
 
     # Evaluated here, because chains would call PyMC's functions from several threads at once.
     starts = [
-        raveled.ravel(point(int(seed.generate_state(1)[0])))
-        for point, seed in zip(points, seeds, strict=True)
+        point(int(seed.generate_state(1)[0])) for point, seed in zip(points, seeds, strict=True)
     ]
-    return [partial(candidates, start) for start in starts]
+    is_common = initvals is None or isinstance(initvals, Mapping)
+    for start, given in zip(starts, [initvals] * len(seeds) if is_common else initvals, strict=True):
+        check_in_support(model, start, given)
+    return [partial(candidates, raveled.ravel(start)) for start in starts]
 
 
 def check_initvals(model: Model, initvals: Any, chains: int) -> None:
@@ -207,6 +210,30 @@ def check_initvals(model: Model, initvals: Any, chains: int) -> None:
             )
         for name, value in (given or {}).items():
             _check_initial_value(model, str(name), value)
+
+
+def check_in_support(
+    model: Model, start: Mapping[str, np.ndarray], given: Mapping[Any, Any] | None
+) -> None:
+    """Raise where given values lie outside the support of their variables: ``start`` is not finite.
+
+    ``start`` has the values on the unconstrained space, by the names of the value variables.
+    """
+    values = {str(name): value for name, value in (given or {}).items()}
+    for rv in model.free_RVs:
+        name = model.rvs_to_values[rv].name
+        is_outside = ~np.isfinite(np.ravel(start[name]))
+        value = values.get(rv.name, values.get(name, model.rvs_to_initial_values[rv]))
+        if value is None or not is_outside.any():
+            continue
+        support = f"the support of its {rv.owner.op._print_name[0]} prior"
+        if (ends := ends_of_support(rv, model)) is not None and np.isfinite(ends).any():
+            lower, upper = (end[is_outside.argmax()] for end in ends)
+            support += f", ({lower:g}, {upper:g})"
+        given_value = value if isinstance(value, Variable) else np.asarray(value).tolist()
+        raise ModelError(
+            f"the initial value of {rv.name!r} must lie inside {support}, got {given_value!r}"
+        )
 
 
 def _check_initial_value(model: Model, name: str, value: Any) -> None:
