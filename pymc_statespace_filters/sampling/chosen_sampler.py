@@ -67,8 +67,9 @@ def sample(
     Parameters
     ----------
     draws, tune : int
-        Draws of each chain that are kept, and iterations of its warm-up, which are not. NUTS needs
-        a warm-up; in the race, where it has the scales of the walk's points, a third of ``tune``.
+        Draws of each chain that are kept, and iterations of its warm-up, which are not. Default of
+        ``draws``: 1000, or ``max_draws`` if that is less. NUTS needs a warm-up; in the race, where
+        it has the scales of the walk's points, a third of ``tune``.
     model : pymc.Model, optional
         Default: the model of the ``with`` block. Its free variables must be continuous.
     until_ess : float or "auto", optional
@@ -220,9 +221,11 @@ def _choice(
 def request_of(sampler: str, given: RunArguments) -> SamplingRequest:
     """What `sample` asks of a sampler."""
     until_ess = target_ess(given.until_ess, given.draws, given.chains)
-    request = replace(given, until_ess=until_ess).request()
     if until_ess is None:
-        return request
+        is_default = given.until_ess == AUTO  # so few draws end where they are
+        most = None if is_default else given.max_draws
+        return replace(given, until_ess=None, max_draws=most).request()
+    request = replace(given, until_ess=until_ess).request()
     most = given.max_draws or MOST_THIN[sampler] * given.draws
     seconds = TIME_LIMIT * min(given.chains, given.cores or available_cores())
     return request._replace(max_draws=most, doubles_thin=True, seconds=seconds)

@@ -72,7 +72,7 @@ def sample_dram(
     ----------
     draws, tune : int
         Draws of each chain that are kept, and iterations of the warm-up before them, during which
-        the proposals are adapted.
+        the proposals are adapted. Default of ``draws``: 1000, or ``max_draws`` if that is less.
     until_ess : float, optional
         Go on until the effective sample sizes of every parameter, over all chains, of the bulk and
         of the tails, are at least this and no R-hat is above 1.01, which takes four chains some 400

@@ -120,8 +120,9 @@ def _is_too_short(walk: EndedRun) -> bool:
 
 def _is_good(run: EndedRun, goal: SamplingRequest) -> bool:
     """Whether draws are worth enough, and can be trusted."""
-    is_left_out = isinstance(run, EndedNuts) and run.diverging.mean() > _DIVERGING
-    return is_enough(goal, run.convergence) and not is_left_out
+    if not is_enough(goal, run.convergence):  # of NUTS there may be no draws
+        return False
+    return not isinstance(run, EndedNuts) or run.diverging.mean() <= _DIVERGING
 
 
 def _from_points(request: SamplingRequest, runs: list[EndedRun]) -> SamplingRequest:

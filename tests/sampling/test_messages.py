@@ -6,6 +6,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
+from pymc_statespace_filters.sampling.target.target import Target
 from tests.kernels import with_kernel
 from tests.sampling.test_dram import simple_model
 from tests.systems import autoregression
@@ -38,7 +39,9 @@ def run_chains(**arguments):
 
 
 def by_nuts(**arguments):
-    return psf.sample(sampler="nuts", model=simple_model(), progressbar=False, **arguments)
+    return psf.sample(
+        sampler="nuts", **{"model": simple_model(), "progressbar": False} | arguments
+    )
 
 
 def run_in_model(**arguments):
@@ -185,13 +188,13 @@ def test_a_wrong_argument_is_named(call, arguments, message):
     assert isinstance(caught.value, ValueError)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "error", "message"),
-    [
-        ({"progressbar": "wide"}, ValueError, r"Invalid value for `progressbar`"),
-        ({"step": None}, TypeError, r"unexpected keyword argument 'step'"),
-    ],
-)
-def test_other_errors(arguments, error, message):
-    with pytest.raises(error, match=message):
-        run_chains(**arguments)
+def test_a_step_method_is_refused():
+    with pytest.raises(TypeError, match="unexpected keyword argument 'step'"):
+        run_chains(step=None)
+
+
+@pytest.mark.parametrize("call", [run_chains, run_models, by_nuts])
+def test_another_bar_is_refused_before_anything_is_compiled(call, monkeypatch):
+    monkeypatch.setattr(Target, "prepare", None)
+    with pytest.raises(ModelError, match=r"True, False or one of .*'split\+stats'.* got 'text'"):
+        call(progressbar="text")

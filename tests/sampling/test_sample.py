@@ -161,6 +161,14 @@ def test_few_draws_are_asked_for_what_they_can_show(draws, chains, said, caplog)
     assert "stayed at one point" not in caplog.text
 
 
+@pytest.mark.parametrize("most", [3, 8])
+def test_draws_follow_max_draws(most):
+    """Fewer than chains, and so few that a run of NUTS that is beaten has none."""
+    tree = sample(max_draws=most, tune=20, model=simple_model(), **QUIET)
+    assert tree["posterior"].sizes["draw"] == most
+    assert tree.attrs["iterations_per_draw"] == 1
+
+
 def test_more_than_the_draws_show(caplog):
     """Half of them and more is allowed, and the advice is the only one that works."""
     call = {"until_ess": 59, "max_draws": 30, "sampler": "dram"}

@@ -173,7 +173,8 @@ def _add_fixed(tree: DataTree, name: str, values: np.ndarray) -> None:
         n_draws = tree[group].sizes["draw"]
         shape = (len(values), n_draws, *values.shape[1:])
         repeated = np.broadcast_to(values[:, None], shape)
-        tree[group].update(dict_to_dataset({name: repeated}))
+        # There may be fewer draws than chains.
+        tree[group].update(dict_to_dataset({name: repeated}, check_conventions=False))
 
 
 def _store_once(tree: DataTree) -> None:

@@ -8,10 +8,11 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from importlib.metadata import version
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from pymc.model import Model
+from pymc.progress_bar import ProgressBarOptions
 from pytensor.graph.basic import Variable
 
 from ...errors import ModelError
@@ -27,6 +28,8 @@ from ..target.settings import RandomWalkSettings
 from .continuation import FormerChains
 
 _MOST_ITERATIONS, _MOST_CHAINS = 10**9, 10**4  # whose arrays are too large for a memory
+_BARS = get_args(ProgressBarOptions)
+DRAWS = 1000  # default of draws, or max_draws if that is less
 _MAX_GROWTH = 20  # default of max_draws, in draws
 
 
@@ -125,9 +128,9 @@ class ExecutionOptions(NamedTuple):
 
     def check(self) -> None:
         """Raise a `ModelError` if an argument is not as ``sample_dram`` describes it."""
-        if not isinstance(self.progressbar, bool | str):
+        if not isinstance(self.progressbar, bool) and self.progressbar not in _BARS:
             raise ModelError(
-                f"progressbar must be True, False or a bar of pm.sample, got {self.progressbar!r}"
+                f"progressbar must be True, False or one of {_BARS}, got {self.progressbar!r}"
             )
         check_flag("compute_convergence_checks", self.compute_convergence_checks)
         check_flag("check", self.checks_filters)
@@ -139,7 +142,7 @@ class ExecutionOptions(NamedTuple):
 class RunArguments:
     """What ``sample_dram``, ``run_models`` and ``sample`` all take, as the user gave it."""
 
-    draws: int = 1000
+    draws: int = DRAWS
     tune: int = 1000
     until_ess: Any = None
     max_draws: Any = None
@@ -153,6 +156,11 @@ class RunArguments:
     discard_tuned_samples: bool = True
     compute_convergence_checks: bool = True
     check: bool = True
+
+    def __post_init__(self) -> None:
+        most = self.max_draws
+        if self.draws == DRAWS and is_integer(most) and 1 <= most < DRAWS:
+            object.__setattr__(self, "draws", int(most))
 
     def options(self, comm: Any) -> ExecutionOptions:
         """How to execute the run, on the ranks of ``comm``."""
