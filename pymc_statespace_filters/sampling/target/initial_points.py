@@ -183,7 +183,8 @@ def chain_candidates(
         point(int(seed.generate_state(1)[0])) for point, seed in zip(points, seeds, strict=True)
     ]
     is_common = initvals is None or isinstance(initvals, Mapping)
-    for start, given in zip(starts, [initvals] * len(seeds) if is_common else initvals, strict=True):
+    each = [initvals] * len(seeds) if is_common else initvals
+    for start, given in zip(starts, each, strict=True):
         check_in_support(model, start, given)
     return [partial(candidates, raveled.ravel(start)) for start in starts]
 
