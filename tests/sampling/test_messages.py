@@ -39,9 +39,7 @@ def run_chains(**arguments):
 
 
 def by_nuts(**arguments):
-    return psf.sample(
-        sampler="nuts", **{"model": simple_model(), "progressbar": False} | arguments
-    )
+    return psf.sample(sampler="nuts", **{"model": simple_model(), "progressbar": False} | arguments)
 
 
 def run_in_model(**arguments):
