@@ -122,7 +122,7 @@ def _is_good(run: EndedRun, goal: SamplingRequest) -> bool:
     """Whether draws are worth enough, and can be trusted."""
     if not is_enough(goal, run.convergence):  # of NUTS there may be no draws
         return False
-    return not isinstance(run, EndedNuts) or run.diverging.mean() <= _DIVERGING
+    return not isinstance(run, EndedNuts) or float(run.diverging.mean()) <= _DIVERGING
 
 
 def _from_points(request: SamplingRequest, runs: list[EndedRun]) -> SamplingRequest:
