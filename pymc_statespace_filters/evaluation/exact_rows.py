@@ -6,7 +6,16 @@ from pytensor.compile.sharedvalue import SharedVariable
 from ..compiler.lowering.compiled_system import compile_system
 from ..compiler.lowering.directions import Directions
 from ..errors import ModelError
+from ..filters.checks import check_system_and_filter
+from ..filters.protocol import Filter
 from ..system.record import Record
+
+
+def check_rows(record: Record, filter: Filter) -> None:
+    """Raise if a filter cannot treat the steps of a record, or its rows have no density."""
+    if record.system.has_instant_steps:
+        check_system_and_filter(record.system, filter)
+    check_exact_rows(record)
 
 
 def check_exact_rows(record: Record) -> None:

@@ -22,7 +22,7 @@ from ..system.given_record import GivenRecord
 from ..system.model import StateSpaceModel
 from ..system.parameters import flat_parameters, panel_parameters
 from ..system.record import Record, check_seed, read_record
-from .exact_rows import check_exact_rows
+from .exact_rows import check_rows
 from .health import tell_of_health
 
 
@@ -40,6 +40,7 @@ def log_likelihood(
     unit: Any = None,
     input_times: Any = None,
     inputs_at: str = "hold",
+    events: Any = None,
     seed: Any = 0,
     comm: Any = None,
     cores: int = 1,
@@ -64,7 +65,7 @@ def log_likelihood(
         then numbers for all G records, or have a leading dimension G; ``seed`` is one number.
     inputs : array_like, shape (rows, n_inputs)
         Row k holds during step k; in a panel, one such array for all records or one for each.
-    t0, unit, input_times, inputs_at
+    t0, unit, input_times, inputs_at, events
         See `StateSpace`.
     seed : int or array_like of int
         Seed of the noise inside the filter, if it has any; broadcasts with the parameters.
@@ -110,10 +111,12 @@ def log_likelihood(
     (2,)
     """
     check_choice(system, filter)
-    given = GivenRecord(observed, panel, steps, times, inputs, t0, unit, input_times, inputs_at)
+    given = GivenRecord(
+        observed, panel, steps, times, inputs, t0, unit, input_times, inputs_at, events
+    )
     n_threads, seeds = check_count("cores", cores, 1), check_seed("seed", seed)
     record = read_record(system, given)
-    check_exact_rows(record)
+    check_rows(record, filter)
     if record.is_panel and comm is not None:
         raise ModelError("comm must be None for a panel: every rank evaluates all records")
     if n_threads > 1 and not record.is_panel:

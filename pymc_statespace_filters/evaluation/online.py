@@ -299,6 +299,11 @@ def online(
     True
     """
     check_choice(system, filter)
+    if system.events is not None:
+        raise ModelError(
+            "online takes no events, and this system has some: run_filter(state=, events=) goes on "
+            "across them"
+        )
     theta = flat_parameters(system, params)
     theta = theta.reshape(math.prod(theta.shape[:-1]), theta.shape[-1])  # of all chains
     if not len(theta):

@@ -25,7 +25,7 @@ from ..system.parameters import panel_parameters
 from ..system.placement import Earlier
 from ..system.record import check_seed, read_record
 from ..system.steps import check_at, rows_at
-from .exact_rows import check_exact_rows
+from .exact_rows import check_rows
 from .health import tell_of_health
 
 STATE, _RECORD, _RESETS = "filter_state", "filter_state_record", "accumulators_reset"
@@ -45,6 +45,7 @@ def run_filter(
     unit: Any = None,
     input_times: Any = None,
     inputs_at: str = "hold",
+    events: Any = None,
     seed: int = 0,
     at: str = "observations",
     state: xr.Dataset | None = None,
@@ -57,7 +58,7 @@ def run_filter(
     filter : a filter of the package, such as EKF, GuidedPF, IMM or FiniteStateFilter
     params : mapping
         A value for every parameter; in a panel of G records, one for all or one for each.
-    observed, steps, times, panel, inputs, t0, unit, input_times, inputs_at
+    observed, steps, times, panel, inputs, t0, unit, input_times, inputs_at, events
         The record, or the records of a panel, as in `log_likelihood`.
     seed : int
         Seed of the noise inside the filter, if it has any. The run is that of `log_likelihood` with
@@ -130,7 +131,9 @@ def run_filter(
     noise = check_seed("seed", seed)
     if noise.ndim:
         raise ModelError(f"run_filter takes one seed, got an array of {noise.shape}")
-    given = GivenRecord(observed, panel, steps, times, inputs, t0, unit, input_times, inputs_at)
+    given = GivenRecord(
+        observed, panel, steps, times, inputs, t0, unit, input_times, inputs_at, events
+    )
     earlier = None
     if state is not None:
         system, earlier = _earlier(system, state)
@@ -144,7 +147,7 @@ def run_filter(
     ]
     common = attributes(system, filter, of_each, noise, record.t0)
     if state is None:
-        check_exact_rows(record)
+        check_rows(record, filter)
     ends = [float(axis.times(axis.steps[-1])) for axis in axes]
     clock = record.clock.stored() | {"ends": ends}
     if system.accumulators:

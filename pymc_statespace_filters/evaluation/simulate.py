@@ -238,6 +238,7 @@ def simulate(
     unit: Any = None,
     input_times: Any = None,
     inputs_at: str = "hold",
+    events: Any = None,
     noise: bool = True,
     random_seed: Any = None,
 ) -> xr.Dataset:
@@ -255,7 +256,7 @@ def simulate(
         are then numbers for all G records, or have a leading dimension G.
     inputs : array_like, shape (rows, n_inputs)
         Row k holds during step k; in a panel, one such array for all records or one for each.
-    t0, unit, input_times, inputs_at
+    t0, unit, input_times, inputs_at, events
         See `StateSpace`.
     noise : bool
         Whether to draw the initial state, process noise and measurement noise. If not, the path
@@ -306,7 +307,7 @@ def simulate(
     {'row': 72, 'state': 1, 'obs': 5, 'observable': 1}
     """
     check_system(system)
-    given = GivenRecord(None, panel, steps, times, inputs, t0, unit, input_times, inputs_at)
+    given = GivenRecord(None, panel, steps, times, inputs, t0, unit, input_times, inputs_at, events)
     record = read_record(system, given)
     system, records = record.system, record.records
     parameters = panel_parameters(system, params, records)

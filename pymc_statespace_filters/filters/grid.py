@@ -128,6 +128,11 @@ class GridFilter:
                 "GridFilter needs process noise, which makes the density smooth, and this system "
                 "has none"
             )
+        if system.model.has_instant_steps:
+            raise ModelError(
+                "GridFilter needs process noise in every step, and that between an event and an "
+                "observation at the same time has no length (before is 1 in the events)"
+            )
         if not system.has_additive_process_noise:
             remedy = "where noise multiplies a positive x, as in x * exp(q), make log(x) the state"
             if getattr(system.model.integrator, "substeps", 1) > 1:

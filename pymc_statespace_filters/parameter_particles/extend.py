@@ -34,6 +34,7 @@ def extend(
     steps: Any = None,
     times: Any = None,
     inputs: Any = None,
+    events: Any = None,
     random_seed: int | np.random.Generator | None = None,
     progressbar: bool = True,
 ) -> xr.DataTree:
@@ -57,6 +58,8 @@ def extend(
         a Series or DataFrame are its times.
     inputs : array_like, optional
         Inputs of all rows, old and new, by step.
+    events : DataFrame or mapping of columns, optional
+        Events after the last row seen, as in `StateSpace`; by default the later ones of the model.
     random_seed : int or numpy.random.Generator, optional
         Seed of the rows to come; by default that of the run, which makes it one with them.
     progressbar : bool
@@ -119,7 +122,7 @@ def extend(
     rows = progress.rows
     if times is None and steps is None:
         times = times_of_data(observed)
-    record = _longer(rows, _new_rows(rows, observed, steps, times, inputs))
+    record = _longer(rows, _new_rows(rows, observed, steps, times, inputs, events))
     if random_seed is not None:
         entropy = check_random_seed(random_seed).integers(2**63, size=2).tolist()
         request = request._replace(entropy=tuple(entropy))
@@ -128,7 +131,9 @@ def extend(
         return finished(progress, request, kept_from(idata), StoredSteps(), progressbar=progressbar)
 
 
-def _new_rows(rows: ObservedRows, observed: Any, steps: Any, times: Any, inputs: Any) -> Record:
+def _new_rows(
+    rows: ObservedRows, observed: Any, steps: Any, times: Any, inputs: Any, events: Any
+) -> Record:
     """The rows that come after those seen, as a record of their own; the others must agree."""
     system, clock = rows.variable.system, rows.variable.clock
     if steps is None and times is None:
@@ -148,7 +153,11 @@ def _new_rows(rows: ObservedRows, observed: Any, steps: Any, times: Any, inputs:
         )
     ends = [float(rows.seen_times[-1])] if system.is_at_any_times else None
     earlier = Earlier(clock, float(rows.record.t0), [int(rows.record.steps[-1])], ends)
-    new = GivenRecord(values[n_old:], **{name: given[n_old:]}, inputs=inputs, t0=earlier.t0)
+    if events is None and rows.variable.events:
+        (events,) = rows.variable.events
+    new = GivenRecord(
+        values[n_old:], **{name: given[n_old:]}, inputs=inputs, t0=earlier.t0, events=events
+    )
     found = read_record(system, new, earlier)
     if found.system != system:
         raise ModelError(

@@ -13,13 +13,14 @@ from pytensor.tensor.variable import TensorVariable
 
 from ..compiler.lowering.compiled_system import compile_system
 from ..errors import ModelError
-from ..evaluation.exact_rows import check_exact_rows
+from ..evaluation.exact_rows import check_rows
 from ..facts import in_words
 from ..filters.checks import Refusal, check_choice
 from ..filters.protocol import Filter, properties
 from ..filters.written import short_form
 from ..system.checks import is_integer
 from ..system.clock import Clock
+from ..system.events import Events
 from ..system.given_record import GivenRecord
 from ..system.model import StateSpaceModel
 from ..system.parameters import (
@@ -91,6 +92,15 @@ class StateSpace(Continuous):
         What inputs with times of their own are between these: the last value, or linear, of which a
         step takes the value in its middle, or at its beginning if the observation, its noise
         included, has the argument u. A held value that changes within a step ends the step there.
+    events : DataFrame or mapping of columns, optional
+        The events of a system that has some, a row for each: the column ``"time"``, numbers or
+        dates as `times`, a column for each number that the system's ``event`` takes, and optionally
+        ``"before"``. Empty columns are a record without events. An event ends a step, as an input
+        that changes does, and acts at the beginning of the next one: an observation at its time
+        sees the state before it, and sums start anew before it. Where ``"before"`` is 1 the event
+        precedes the observation, by a step of length zero. Events after the last observation are
+        those of forecasts. In a panel, one table for all records, or a mapping from labels or list
+        of tables.
     seed : int
         Seed of the noise inside the filter; in a panel, the noise of each record depends on it and
         on the record's label. The model stores it as shared data ``{name}_seed``,
@@ -154,6 +164,7 @@ class StateSpace(Continuous):
         unit: Any = None,
         input_times: Any = None,
         inputs_at: str = "hold",
+        events: Any = None,
         seed: int = 0,
         score_from: int = 0,
         dims: Sequence[str] | None = None,
@@ -175,9 +186,11 @@ class StateSpace(Continuous):
         others = tuple(model.named_vars)
         full_name = model.name_for(name)
         _check_name(model, full_name, name, system)
-        given = GivenRecord(observed, panel, steps, times, inputs, t0, unit, input_times, inputs_at)
+        given = GivenRecord(
+            observed, panel, steps, times, inputs, t0, unit, input_times, inputs_at, events
+        )
         record = read_record(system, given, symbolic=True)
-        check_exact_rows(record)
+        check_rows(record, filter)
         if panel is None:
             theta = symbolic_parameters(system, values, others)
             row_dim, component_dim = _dims(dims, f"{full_name}_time")
@@ -215,6 +228,7 @@ class StateSpace(Continuous):
             score_from=_check_score_from(score_from, n_rows, system, filter),
             clock=record.clock,
             timed=record.timed,
+            events=record.events,
             observed=data,
             dims=(row_dim, component_dim),
         )
@@ -228,6 +242,7 @@ class StateSpace(Continuous):
         score_from: int = 0,
         clock: Clock = NUMBERS,
         timed: tuple[TimedInputs, ...] = (),
+        events: tuple[Events, ...] = (),
         **kwargs: Any,
     ) -> Any:
         """Make the variable without a model; parameters are theta, steps, inputs, t0 and seed."""
@@ -238,7 +253,7 @@ class StateSpace(Continuous):
         ]
         settings = {
             "system": system, "filter": filter, "score_from": score_from, "clock": clock,
-            "timed": timed,
+            "timed": timed, "events": events,
         }  # fmt: skip
         return super().dist(symbols, **settings, **kwargs)
 
@@ -251,6 +266,7 @@ class StateSpace(Continuous):
         score_from: int,
         clock: Clock,
         timed: tuple[TimedInputs, ...],
+        events: tuple[Events, ...],
         rng: Any = None,
         **kwargs: Any,
     ) -> TensorVariable:
@@ -258,8 +274,9 @@ class StateSpace(Continuous):
         rng = pt.random.shared_rng(seed=None) if rng is None else rng
         kind = PanelRV if params[1].type.ndim == 2 else StateSpaceRV
         operation = kind(
-            system=system, filter=filter, score_from=score_from, clock=clock, timed=timed
-        )
+            system=system, filter=filter, score_from=score_from, clock=clock, timed=timed,
+            events=events,
+        )  # fmt: skip
         _, draw = operation(*params, rng=rng, return_next_rng=True, **kwargs)
         return draw
 

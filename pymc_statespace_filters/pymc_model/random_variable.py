@@ -19,6 +19,7 @@ from pytensor.tensor.random.op import RandomVariable
 
 from ..filters.protocol import Filter
 from ..system.clock import Clock
+from ..system.events import Events
 from ..system.input_columns import only_seen
 from ..system.model import StateSpaceModel
 from ..system.timed_inputs import TimedInputs
@@ -31,13 +32,21 @@ class StateSpaceRV(RandomVariable):
 
     The log-density leaves out the terms of the first ``score_from`` rows. ``clock`` turns model
     times into those of the user, for results; ``timed`` are the inputs of each record as the user
-    gave them, if with times of their own, for forecasts.
+    gave them, if with times of their own, and ``events`` its events, for forecasts.
     """
 
     name = "StateSpace"
     signature = "(k),(j),(s,u),(),()->(j,p)"
     dtype = "float64"
-    __props__ = (*RandomVariable.__props__, "system", "filter", "score_from", "clock", "timed")
+    __props__ = (
+        *RandomVariable.__props__,
+        "system",
+        "filter",
+        "score_from",
+        "clock",
+        "timed",
+        "events",
+    )
     _print_name = ("StateSpace", "\\operatorname{StateSpace}")
 
     def __init__(
@@ -48,6 +57,7 @@ class StateSpaceRV(RandomVariable):
         score_from: int = 0,
         clock: Clock = NUMBERS,
         timed: tuple[TimedInputs, ...] = (),
+        events: tuple[Events, ...] = (),
         **settings: Any,
     ) -> None:
         self.system = system
@@ -55,6 +65,7 @@ class StateSpaceRV(RandomVariable):
         self.score_from = score_from
         self.clock = clock
         self.timed = timed
+        self.events = events
         super().__init__(**settings)
 
     def __str__(self) -> str:

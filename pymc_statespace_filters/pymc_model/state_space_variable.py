@@ -16,6 +16,7 @@ from ..ops.at_points import FilterAtPoints
 from ..ops.likelihood import LogLikelihood, TapedLogLikelihood
 from ..ops.states import Predictions, States, TermHealth
 from ..system.clock import Clock
+from ..system.events import Events
 from ..system.model import StateSpaceModel
 from ..system.timed_inputs import TimedInputs
 from .inspection import state_space_nodes
@@ -27,7 +28,8 @@ class StateSpaceVariable(NamedTuple):
 
     ``dims`` names time and observables; theta and inputs may depend on the free variables. Terms of
     the rows before ``score_from`` do not count. The variable of a panel has theta (G, k) and rows
-    (J, 3), see `system.record`, as steps. ``timed`` are the inputs of each record that have times.
+    (J, 3), see `system.record`, as steps. ``timed`` are the inputs of each record that have
+    times, and ``events`` the events of each.
     """
 
     name: str
@@ -43,6 +45,7 @@ class StateSpaceVariable(NamedTuple):
     score_from: int
     clock: Clock
     timed: tuple[TimedInputs, ...] = ()
+    events: tuple[Events, ...] = ()
 
     @property
     def is_panel(self) -> bool:
@@ -62,7 +65,15 @@ def observed_variables(model: pm.Model) -> list[StateSpaceVariable]:
             record = (theta, steps, inputs_as_seen(op, inputs, steps, value), t0, seed, value)
             found.append(
                 StateSpaceVariable(
-                    name, op.system, op.filter, dims, *record, op.score_from, op.clock, op.timed
+                    name,
+                    op.system,
+                    op.filter,
+                    dims,
+                    *record,
+                    op.score_from,
+                    op.clock,
+                    op.timed,
+                    op.events,
                 )
             )
     return found

@@ -15,7 +15,8 @@ from ..pymc_model.checked_model import checked_model
 from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.state_space_variable import observed_variables
 from ..system.checks import check_random_seed, is_integer
-from ..system.given_record import inputs_with_times, own_inputs
+from ..system.events import Events, read_events, with_events
+from ..system.given_record import events_of_records, inputs_with_times, own_inputs
 from ..system.input_columns import (
     inputs_of_other_shape,
     inputs_of_user,
@@ -27,7 +28,14 @@ from ..system.model import StateSpaceModel
 from ..system.own_units import in_own_units
 from ..system.placement import check_takes
 from ..system.steps import GRID_TOLERANCE, check_steps
-from ..system.time_axis import TimeAxis, TimesBetween, axis_of, check_increasing, is_grid
+from ..system.time_axis import (
+    NO_EVENTS,
+    TimeAxis,
+    TimesBetween,
+    axis_of,
+    check_increasing,
+    is_grid,
+)
 from ..system.timed_inputs import check_inputs_at, timed_inputs
 from .draws import select_draws
 from .groups import add_group, results_by_row, state_dims
@@ -46,6 +54,7 @@ def forecast(
     inputs: Any = None,
     input_times: Any = None,
     inputs_at: str = "hold",
+    events: Any = None,
     var_name: str | None = None,
     filter: Any = None,
     new_data: bool = False,
@@ -82,6 +91,9 @@ def forecast(
         Times of the rows of `inputs`, and what inputs are between them, as in `StateSpace`. Inputs
         of the model with times of their own go on with their last value where no others are given,
         and hold up to the first time of others.
+    events : DataFrame or mapping of columns, optional
+        Events after the last observation, as in `StateSpace`; by default the later ones of the
+        model.
 
     Returns
     -------
@@ -134,8 +146,10 @@ def forecast(
         at_draws = VariableAtDraws(model, variable, draws)
         timed = _timed_inputs(at_draws, inputs, input_times, inputs_at)
         axes = [
-            _future_axis(n_steps, steps, times, record, changes)
-            for record, (_, changes) in zip(at_draws.records, timed, strict=True)
+            _future_axis(n_steps, steps, times, record, changes, own)
+            for record, (_, changes), own in zip(
+                at_draws.records, timed, _events(at_draws, events), strict=True
+            )
         ]
         if timed[0][0] is not None:
             pairs = zip(timed, axes, at_draws.records, strict=True)
@@ -204,6 +218,23 @@ def _timed_inputs(
     return [(one, one.changes()) for one in found]
 
 
+def _events(at_draws: VariableAtDraws, events: Any) -> list[Events | None]:
+    """The events of each record, past and future."""
+    variable, records = at_draws.variable, at_draws.records
+    of_model: list[Events | None] = [*variable.events] or [None] * len(records)
+    if events is None:
+        return of_model
+    found = []
+    labels = [record.label for record in records]
+    tables = events_of_records(events, labels)
+    for earlier, table, record in zip(of_model, tables, records, strict=True):
+        system, clock = variable.system, variable.clock
+        later = read_events(table, system, clock, record.t0, record.number)
+        end = float(record.axis.times(record.steps[-1]))
+        found.append(earlier and later and earlier.followed_by(later, end))
+    return found
+
+
 def _from_step_0(inputs: Any, at_draws: VariableAtDraws, axes: Sequence[TimeAxis]) -> Any:
     """The inputs with those of the model before them where they are future ones alone."""
     records, is_panel = at_draws.records, at_draws.variable.is_panel
@@ -230,7 +261,12 @@ def _after_past(given: Any, record: RecordAtDraws, axis: TimeAxis) -> Any:
 
 
 def _future_axis(
-    n_steps: int | None, steps: Any, times: Any, record: RecordAtDraws, changes: Array
+    n_steps: int | None,
+    steps: Any,
+    times: Any,
+    record: RecordAtDraws,
+    changes: Array,
+    events: Events | None,
 ) -> TimeAxis:
     """The axis of a record and its future, with the steps to predict."""
     past, system = record.axis, record.variable.system
@@ -257,11 +293,12 @@ def _future_axis(
         )
     check_increasing("times", numbers, record.shown)
     changes = changes[(changes > end) & (changes < numbers[-1])]
+    when = NO_EVENTS if events is None else events.at
     if system.is_at_any_times:
-        return past.followed_by(numbers, changes)
-    given = TimesBetween(None, numbers, record.t0, changes)
+        return with_events(past.followed_by(numbers, changes, when), events)
+    given = TimesBetween(None, numbers, record.t0, changes, when)
     if is_grid([given], system.dt):
-        return axis_of(given, system.dt, on_grid=True)
+        return with_events(axis_of(given, system.dt, on_grid=True), events)
     check_takes(system, given, record.variable.clock, record.number)
     if system.n_inputs:
         raise ModelError(
@@ -269,7 +306,7 @@ def _future_axis(
             f"steps of a model with inputs whose record does, t0 = {record.t0:g} and dt = "
             f"{system.dt:g}, got times {record.shown(numbers)}"
         )
-    return past.followed_by(numbers, changes)
+    return with_events(past.followed_by(numbers, changes, when), events)
 
 
 def _simulate(

@@ -19,7 +19,7 @@ from ..parallel.threads import run_in_threads
 from ..pymc_model.checked_model import checked_model
 from ..pymc_model.state_space_variable import observed_variables
 from ..system.checks import check_flag, check_random_seed, shortened
-from ..system.given_record import inputs_with_times
+from ..system.given_record import events_of_records, inputs_with_times
 from ..system.input_columns import check_inputs, only_seen
 from ..system.model import StateSpaceModel
 from ..system.own_units import in_own_units
@@ -39,6 +39,7 @@ def free_run(
     inputs: Any = None,
     input_times: Any = None,
     inputs_at: str = "hold",
+    events: Any = None,
     steps: Any = None,
     times: Any = None,
     observed: Any = None,
@@ -69,10 +70,12 @@ def free_run(
         The same as times, numbers or dates as those of the model. Give at most one of both.
     input_times, inputs_at
         Times of the rows of `inputs`, and what inputs are between them, as in `StateSpace`.
+    events : DataFrame or mapping of columns, optional
+        Events, as in `StateSpace`; by default those of the model.
     observed : array_like, shape (R, p) or (R,), optional
         Measurements at these steps, to compare the predictions with; NaN where missing. By default
-        the record of the model from ``score_from`` on, if the run has its inputs and steps, else
-        none. A panel is compared with its own data alone.
+        the record of the model from ``score_from`` on, if the run has its inputs, events and steps,
+        else none. A panel is compared with its own data alone.
     noise : bool
         Whether the initial state, process noise and measurement noise are drawn. By default none
         is: a run starts at the initial mean, and its observations are those of `simulate` with
@@ -156,13 +159,13 @@ def free_run(
             f"{[variable.name for variable in variables]}"
         )
     is_elsewhere = steps is not None or times is not None
-    is_own_run = inputs is None and not is_elsewhere
+    is_own_run = inputs is None and events is None and not is_elsewhere
     is_compared = observed is not None or is_own_run
     dims = state_dims(observed_variables(model))
     parts = []
     for variable in variables:
         at_draws = VariableAtDraws(model, variable, draws)
-        placed = _placed(at_draws, steps, times, inputs, input_times, inputs_at)
+        placed = _placed(at_draws, steps, times, inputs, input_times, inputs_at, events)
         name, (time, observable) = variable.name, variable.dims
         names: dict[str, Any] = {observable: list(variable.system.observables)}
         paths, seen, errors = [], [], []
@@ -207,6 +210,7 @@ def _placed(
     inputs: Any,
     input_times: Any,
     inputs_at: Any,
+    events: Any,
 ) -> list[Placement]:
     """Where each record runs, by default that of the data; its inputs are None if the model's."""
     variable, records = at_draws.variable, at_draws.records
@@ -217,13 +221,16 @@ def _placed(
     if inputs is None and is_elsewhere and variable.timed:
         inputs_at = variable.timed[0].rule
     own_inputs, own_times = _inputs_of_records(at_draws, inputs, input_times, is_elsewhere)
+    own_events: Sequence[Any] = variable.events or [None] * len(records)
+    if events is not None:
+        own_events = events_of_records(events, [record.label for record in records])
     found = []
-    for record, rows, row_times in zip(
-        records, own_inputs, own_times or [None] * len(records), strict=True
+    for record, rows, row_times, table in zip(
+        records, own_inputs, own_times or [None] * len(records), own_events, strict=True
     ):
         system, at = variable.system, steps
         if steps is None and times is None:
-            if row_times is None:
+            if row_times is None and events is None:
                 found.append(Placement(system, variable.clock, [record.axis], [rows]))
                 continue
             if system.is_at_any_times:
@@ -237,7 +244,7 @@ def _placed(
             )
         timing = Timing(
             None if at is None else [at], None if at is not None else [times], record.t0, None,
-            [rows], None if row_times is None else [row_times], inputs_at,
+            [rows], None if row_times is None else [row_times], inputs_at, [table],
         )  # fmt: skip
         one = place_by(variable.clock, record.t0, system, timing, [record.number])
         if one.inputs[0] is None and system.n_inputs and one.system.is_at_any_times:

@@ -16,7 +16,12 @@ from ..pymc_model.state_space_variable import (
     states_of,
     term_health_of,
 )
-from ..system.input_columns import inputs_of_user, n_input_rows, with_columns
+from ..system.input_columns import (
+    columns_of_steps,
+    inputs_of_user,
+    n_input_rows,
+    with_columns,
+)
 from ..system.model import StateSpaceModel
 from ..system.time_axis import TimeAxis
 
@@ -91,12 +96,13 @@ class RecordAtDraws:
     def axis(self) -> TimeAxis:
         """The steps of the record in time."""
         system = self.variable.system
+        of_steps = columns_of_steps(system, self.inputs[0])
         if not system.is_at_any_times:
-            return TimeAxis(self.steps, self.t0, system.dt)
+            return TimeAxis(self.steps, self.t0, system.dt, columns=of_steps)
         columns = self.inputs[0, : self.steps[-1] + 1, system.n_inputs :]
         lengths, starts = columns[:, 0].copy(), columns[:, 1].copy()
         lengths[-1] = 0.0
-        return TimeAxis(self.steps, self.t0, system.dt, starts, lengths)
+        return TimeAxis(self.steps, self.t0, system.dt, starts, lengths, of_steps)
 
     def shown(self, times: Any) -> Any:
         """The user's times."""

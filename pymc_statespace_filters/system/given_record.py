@@ -15,6 +15,7 @@ from .clock import Clock, are_dates, date_index, times_of_data
 from .model import StateSpaceModel
 from .panel_records import Records
 from .placement import Earlier, Placement, Timing, place
+from .signature import TIME
 from .timed_inputs import times_of_inputs
 
 
@@ -31,6 +32,7 @@ class GivenRecord:
     unit: Any = None
     input_times: Any = None
     inputs_at: Any = "hold"
+    events: Any = None
 
     def current(self) -> "GivenRecord":
         """The same with the current numbers of symbolic steps and labels."""
@@ -63,7 +65,8 @@ class GivenRecord:
         timing = Timing(
             _by_record("steps", self.steps, records),
             _by_record("times", self._own_times(records), records),
-            self.t0, self.unit, inputs, input_times, self.inputs_at, earlier,
+            self.t0, self.unit, inputs, input_times, self.inputs_at,
+            events_of_records(self.events, records.labels), earlier,
         )  # fmt: skip
         return place(system, timing, records.check_each)
 
@@ -149,6 +152,28 @@ def of_each_record(name: str, values: Any, labels: Sequence[Any]) -> list[Any]:
     """
     own = None if list(labels) == [None] else own_inputs(values, labels, name)
     return [values] * len(labels) if own is None else own
+
+
+def events_of_records(events: Any, labels: Sequence[Any]) -> list[Any]:
+    """The table of events of each record: their own, by label or in order, or one for all."""
+    is_table = isinstance(events, pd.DataFrame) or (isinstance(events, Mapping) and TIME in events)
+    if events is None or is_table or list(labels) == [None]:
+        return [events] * len(labels)
+    if isinstance(events, Mapping):
+        if (wrong := [label for label in labels if label not in events]) or (
+            wrong := [label for label in events if label not in labels]
+        ):
+            raise ModelError(
+                "events must have a table for each record, an empty one for a record without "
+                f"events, got another label or none: {shortened(wrong)}"
+            )
+        return [events[label] for label in labels]
+    if not isinstance(events, list | tuple) or len(events) != len(labels):
+        raise ModelError(
+            f"events must be a table for all records, or one for each of the {len(labels)}, got "
+            f"{shortened(events)}"
+        )
+    return list(events)
 
 
 def inputs_with_times(

@@ -7,6 +7,7 @@ are, in this order,
   which it begins;
 * for each number of steps for which some drifting parameters are held, a one where they move at the
   end of the step, and a zero elsewhere;
+* of a system with events, a one where the step begins with an event, and the numbers of the event;
 * for each accumulator a one where the step begins at an observation at which it is set to zero, and
   a zero elsewhere.
 
@@ -39,7 +40,7 @@ class InputRow(NamedTuple):
     """A row of inputs as a symbol: whole, the user's part, and the length and time of the step.
 
     The latter are None for a system on a grid. ``moves`` has an element for each number of steps
-    for which parameters are held.
+    for which parameters are held, and ``columns`` are the numbers of the step from `TimeAxis`.
     """
 
     whole: TensorVariable
@@ -47,20 +48,28 @@ class InputRow(NamedTuple):
     length: TensorVariable | None
     time: TensorVariable | None
     moves: Mapping[int, TensorVariable]
+    columns: TensorVariable
 
 
 def input_row(
-    n_inputs: int, *, at_any_times: bool, n_accumulators: int, held_for: Sequence[int]
+    n_inputs: int,
+    *,
+    at_any_times: bool,
+    n_accumulators: int,
+    held_for: Sequence[int],
+    n_of_step: int,
 ) -> InputRow:
-    """The symbol of a row."""
+    """The symbol of a row; ``n_of_step`` are the columns of a `TimeAxis`."""
     first_move = n_inputs + 2 * at_any_times
-    n_columns = first_move + len(held_for) + n_accumulators
+    first_column = first_move + len(held_for)
+    n_columns = first_column + n_of_step + n_accumulators
     u = pt.tensor("u", shape=(n_columns,), dtype="float64")
     of_user = u[:n_inputs] if n_columns > n_inputs else u
     moves = {every: u[first_move + i] for i, every in enumerate(held_for)}
+    columns = u[first_column : first_column + n_of_step]
     if not at_any_times:
-        return InputRow(u, of_user, None, None, moves)
-    return InputRow(u, of_user, u[n_inputs], u[n_inputs + 1], moves)
+        return InputRow(u, of_user, None, None, moves, columns)
+    return InputRow(u, of_user, u[n_inputs], u[n_inputs + 1], moves, columns)
 
 
 def reset(
@@ -68,7 +77,6 @@ def reset(
 ) -> TensorVariable:
     """The state from which a step begins, for the indices of the accumulators."""
     for column, i in enumerate(accumulators, -len(accumulators)):
-        # A product, because a switch would count as an equation with a kink.
         x = pt.set_subtensor(x[i], (1.0 - input_row[column]) * x[i])
     return x
 
@@ -151,6 +159,7 @@ def with_columns(
         n_rows = n_input_rows(system, at) if xp is np else pt.max(pt.concatenate([at, [0]]))
     columns: list[Any] = [axis.lengths, axis.starts] if axis.starts is not None else []
     columns += [_moves(xp.arange(n_rows), every, axis) for every in system.held_for]
+    columns += _columns_of_step(axis, 0, n_rows, system.n_step_columns)
     if system.accumulators:
         at_observation = _replaced(xp.zeros(n_rows + 1), at, 1.0)
         columns += [at_observation] * len(system.accumulators)
@@ -182,10 +191,25 @@ def columns_between(
     """
     own: list[Any] = [axis.lengths, axis.starts] if axis.starts is not None else []
     own += [_moves(first + np.arange(len(inputs)), every, axis) for every in system.held_for]
+    own += _columns_of_step(axis, first, len(inputs), system.n_step_columns)
     if system.accumulators:
         is_first = np.arange(len(inputs)) == 0
         own += [is_first * reset for reset in resets]
     return np.column_stack([inputs, *own])
+
+
+def _columns_of_step(axis: TimeAxis, first: int, n_rows: Any, n_columns: int) -> list[Any]:
+    """The columns of an axis for steps from ``first`` on; zeros where it has none."""
+    if not n_columns:
+        return []
+    known = np.zeros((0, n_columns)) if axis.columns is None else axis.columns[first:]
+    if isinstance(n_rows, Variable):
+        zeros = pt.zeros((pt.maximum(n_rows - len(known), 0), n_columns))
+        rows = pt.concatenate([known, zeros])[:n_rows]
+        return [rows[:, i] for i in range(n_columns)]
+    rows = np.zeros((n_rows, n_columns))
+    rows[: len(known)] = known[:n_rows]
+    return list(rows.T)
 
 
 def _moves(number: Any, every: int, axis: TimeAxis) -> Any:
@@ -280,6 +304,14 @@ def inputs_of_user(system: "StateSpaceModel", rows: np.ndarray) -> np.ndarray:
     return rows[..., : system.n_inputs]
 
 
+def columns_of_steps(system: "StateSpaceModel", rows: np.ndarray) -> np.ndarray | None:
+    """The columns (rows, n) of a `TimeAxis` in rows of inputs (rows, n_input_columns)."""
+    if not system.n_step_columns:
+        return None
+    end = system.n_input_columns - len(system.accumulators)
+    return rows[:, end - system.n_step_columns : end]
+
+
 def times_of_steps(system: "StateSpaceModel", inputs: Any, steps: Any, t0: Any) -> Any:
     """The times at which steps begin, from the inputs (rows, n_input_columns) of a record."""
     if system.is_at_any_times:
@@ -302,7 +334,11 @@ def divided(system: "StateSpaceModel", rows: Any, factor: int) -> Any:
     for i in range(first_move, first_move + len(system.held_for)):
         columns[i] = columns[i] * is_last
     is_first = xp.eq(number, 0) if xp is pt else number == 0
-    for i in range(-len(system.accumulators), 0):  # a step, not each of its parts
+    # A step, not each of its parts, begins with an event, and with sums that are zero again.
+    flags = [-i for i in range(1, len(system.accumulators) + 1)]
+    if system.events is not None:
+        flags.append(first_move + len(system.held_for))
+    for i in flags:
         columns[i] = columns[i] * is_first
     return xp.stack(columns, axis=-1) if columns else repeated
 

@@ -15,7 +15,14 @@ from .graph_digest import describe, digest
 from .integrators.protocol import Integrator, bound_to_states
 from .labels import default_names
 from .readers import observables_that_read
-from .signature import checked_names, names_of_states, read_signature, size_of
+from .signature import (
+    check_names_of_events,
+    checked_events,
+    checked_names,
+    names_of_states,
+    read_signature,
+    size_of,
+)
 from .tracing import INPUT_ROW, Equations, read, size, trace
 
 # What a system keeps beside its fields, to trace it again.
@@ -83,6 +90,12 @@ class StateSpaceModel:
         When that is: where an observable that depends on the accumulator is not missing, the
         default, for a value that counts all since the last one, as a quarterly sum among months;
         or in every row, also one of NaN, for a value that counts since the row before.
+    event : callable, optional
+        ``f(x, u, t, ...)`` returning the state after an event, such as a dose, a refill or an
+        impact, at times that the data give (``events`` of `StateSpace`). An observation at the time
+        of an event sees the state before it, unless the data say otherwise.
+    events : sequence of str
+        Arguments of ``event`` that the data give for each, such as the amount of a dose.
 
     Raises
     ------
@@ -126,6 +139,8 @@ class StateSpaceModel:
         carried: Sequence[str] = (),
         accumulators: Sequence[str] = (),
         resets: str | None = None,
+        event: Callable | None = None,
+        events: Sequence[str] = (),
     ) -> None:
         self._trace(
             {
@@ -140,6 +155,8 @@ class StateSpaceModel:
                 "initial_mean": initial_mean,
                 "initial_cov": initial_cov,
                 "initial_dist": initial_dist,
+                "event": event,
+                "events": checked_events(event, events),
             },
             states=states,
             observables=observables,
@@ -167,12 +184,14 @@ class StateSpaceModel:
         """Set all fields, from what the user wrote."""
         functions = read(**written)
         signature = read_signature(functions.equations, shapes, inputs).with_drift(drifting)
+        check_names_of_events(written["events"], signature.parameters)
         symbols = size(
             functions,
             signature,
             drifting,
             n_accumulators=len(accumulators),
             at_any_times=at_any_times,
+            events=written["events"],
         )
         state_names = checked_names("states", states, default_names("x", symbols.n_written))
         state_names += tuple(one.name for one in drifting)
@@ -199,6 +218,7 @@ class StateSpaceModel:
             carried=names_of_states("carried", carried, state_names),
             accumulators=totals,
             resets=_checked_resets(resets),
+            events=None if functions.event is None else written["events"],
             drifting=tuple(drifting),
             additive_noise=seen.additive,
             discrete_noise=symbols.drawn is not None and symbols.drawn.is_discrete,
@@ -210,6 +230,7 @@ class StateSpaceModel:
             keeps_noises=False,
             equations=equations,
             known=(),
+            has_instant_steps=False,
         )
         names = {"states": states, "observables": observables, "inputs": inputs}
         others = {
@@ -248,6 +269,10 @@ class StateSpaceModel:
     equations: Equations
     # Elements of the flat parameters that a model fixes, and their numbers.
     known: tuple[tuple[int, float], ...] = ()
+    # Names of the numbers of an event; None without events.
+    events: tuple[str, ...] | None = None
+    # Whether the data have events before an observation at the same time.
+    has_instant_steps: bool = False
 
     def _set(self, **attributes: Any) -> None:
         self.__dict__.update(attributes)
@@ -321,12 +346,13 @@ class StateSpaceModel:
 
         Its equations are as they were, so that nothing is compiled anew; see `folded`.
         """
-        if known == self.known:
+        return self if known == self.known else self._with_data(known=known)
+
+    def with_instant_steps(self, has_instant_steps: bool = True) -> "StateSpaceModel":
+        """The same system for data in which some steps have no length, so no noise."""
+        if has_instant_steps == self.has_instant_steps:
             return self
-        system = object.__new__(StateSpaceModel)
-        own = {name: value for name, value in self.__dict__.items() if name in _AS_WRITTEN}
-        system._set(**self.__getstate__() | own | {"known": known})
-        return system
+        return self._with_data(has_instant_steps=has_instant_steps)
 
     @cached_property
     def folded(self) -> "StateSpaceModel":
@@ -350,6 +376,13 @@ class StateSpaceModel:
     def _with(self, **attributes: Any) -> "StateSpaceModel":
         system = object.__new__(StateSpaceModel)
         system._set(**self.__getstate__() | attributes)
+        return system
+
+    def _with_data(self, **attributes: Any) -> "StateSpaceModel":
+        """The same equations with other facts of the data, which can be traced again."""
+        own = {name: value for name, value in self.__dict__.items() if name in _AS_WRITTEN}
+        system = self._with(**attributes)
+        system._set(**own)
         return system
 
     def with_integrator(
@@ -424,7 +457,7 @@ class StateSpaceModel:
         if drifting is not None:
             settings = settings | {"drifting": drifting}
         system._trace(own["_written"] | changes, **settings, at_any_times=at_any_times)
-        system._set(known=self.known)
+        system._set(known=self.known, has_instant_steps=self.has_instant_steps)
         return system
 
     @property
@@ -435,8 +468,13 @@ class StateSpaceModel:
     @property
     def is_at_any_times(self) -> bool:
         """Whether length and time of a step are columns of inputs."""
-        other = len(self.held_for) + len(self.accumulators)
+        other = len(self.held_for) + self.n_step_columns + len(self.accumulators)
         return self.n_input_columns > self.n_inputs + other
+
+    @property
+    def n_step_columns(self) -> int:
+        """Number of the columns of a `TimeAxis`: the flag of an event, and its numbers."""
+        return 0 if self.events is None else 1 + len(self.events)
 
     @property
     def names_resets(self) -> bool:
@@ -461,7 +499,7 @@ class StateSpaceModel:
     @cached_property
     def fingerprint(self) -> str:
         """A digest of the equations and settings, the same in every process."""
-        return digest(describe(self.with_known(())))
+        return digest(describe(self.with_known(()).with_instant_steps(False)))
 
 
 def _checked_resets(resets: Any) -> str:

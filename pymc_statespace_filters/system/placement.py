@@ -7,10 +7,13 @@ import numpy as np
 
 from ..errors import ModelError
 from .clock import Clock, are_dates, check_zones, clock_and_start, unit_text
+from .events import Events, read_events, with_events
 from .model import StateSpaceModel
 from .panel_records import ALONE
+from .signature import BEFORE
 from .steps import GRID_TOLERANCE, check_steps
 from .time_axis import (
+    NO_EVENTS,
     TimeAxis,
     TimesBetween,
     axis_of,
@@ -18,6 +21,7 @@ from .time_axis import (
     divided_axis,
     is_grid,
     off_grid,
+    preceding,
 )
 from .timed_inputs import TimedInputs, check_inputs_at, timed_inputs, times_of_inputs
 
@@ -43,7 +47,7 @@ class Earlier(NamedTuple):
                 f"{self.clock.shown([end], record)[0]}, got "
                 f"{self.clock.shown(given.times[:1], record)[0]}"
             )
-        own = divided_axis(given.times, t0=end, dt=dt, breaks=given.breaks)
+        own = divided_axis(given.times, t0=end, dt=dt, breaks=given.breaks, events=given.events)
         assert own.starts is not None
         assert own.lengths is not None
         starts = np.concatenate([np.full(k, end), own.starts])
@@ -54,8 +58,8 @@ class Earlier(NamedTuple):
 class Timing(NamedTuple):
     """What a user says of the times of some records; of a list, an entry for each record.
 
-    ``steps`` or ``times`` is None; ``input_times`` is None for inputs by step, and for those
-    whose index holds their dates.
+    ``events`` are tables, or what `read_events` has made of them. ``steps`` or ``times`` is None;
+    ``input_times`` is None for inputs by step, and for those whose index holds their dates.
     """
 
     steps: list[Any] | None
@@ -65,6 +69,7 @@ class Timing(NamedTuple):
     inputs: list[Any]
     input_times: list[Any] | None
     inputs_at: Any
+    events: list[Any]
     earlier: Earlier | None = None
 
 
@@ -72,7 +77,8 @@ class Placement(NamedTuple):
     """The axis of each record, and its inputs by step, as the user gave them or from their times.
 
     ``system`` is the one at any times where an axis is not a grid; ``timed`` are
-    the inputs of each record that have times of their own, if they do.
+    the inputs of each record that have times of their own, if they do, and ``events`` its events,
+    if the system has some.
     """
 
     system: StateSpaceModel
@@ -80,6 +86,7 @@ class Placement(NamedTuple):
     axes: list[TimeAxis]
     inputs: list[Any]
     timed: tuple[TimedInputs, ...] = ()
+    events: tuple[Events, ...] = ()
 
 
 def place(
@@ -126,10 +133,18 @@ def place_by(
             ),
             numbers, timing.inputs, input_times,
         )  # fmt: skip
+    events = check_each(
+        lambda g, own: (
+            own if isinstance(own, Events) else read_events(own, system, clock, t0, g)
+        ),
+        numbers, timing.events,
+    )  # fmt: skip
     nothing = [None] * len(numbers)
     changes = [np.empty(0)] * len(numbers) if timed is None else [one.changes() for one in timed]
 
-    def between(g: int, steps: Any, times: Any, changes: np.ndarray) -> TimesBetween:
+    def between(
+        g: int, steps: Any, times: Any, changes: np.ndarray, own: Events | None
+    ) -> TimesBetween:
         if steps is None:
             at = _times_from(t0, times, system.dt, clock, g)
         else:
@@ -137,21 +152,28 @@ def place_by(
             at = t0 + steps * system.dt
         # Inputs may change before step 0 or after the last observation.
         inside = (changes > t0) & (changes < at[-1])
-        return TimesBetween(steps, at, t0, changes[inside])
+        when = NO_EVENTS if own is None else own.at
+        return TimesBetween(steps, at, t0, changes[inside], when)
 
-    given = check_each(between, numbers, timing.steps or nothing, timing.times or nothing, changes)
+    given = check_each(
+        between, numbers, timing.steps or nothing, timing.times or nothing, changes, events
+    )
     if not is_grid(given, system.dt):
         check_each(lambda g, one: check_takes(system, one, clock, g), numbers, given)
         system = system.at_any_times
+    if any(preceding(one, system.dt).any() for one in given):
+        system = system.with_instant_steps()
     earlier, is_on_grid = timing.earlier, not system.is_at_any_times
     if earlier is not None and not is_on_grid:
         axes = check_each(lambda g, one: earlier.axis(one, system.dt, g), numbers, given)
     else:
         axes = check_each(lambda one: axis_of(one, system.dt, on_grid=is_on_grid), given)
+    axes = [with_events(axis, own) for axis, own in zip(axes, events, strict=True)]
+    found = tuple(own for own in events if own is not None)
     if timed is None:
-        return Placement(system, clock, axes, timing.inputs)
+        return Placement(system, clock, axes, timing.inputs, (), found)
     rows = check_each(lambda g, one, axis: one.rows(axis, clock, g), numbers, timed, axes)
-    return Placement(system, clock, axes, rows, tuple(timed))
+    return Placement(system, clock, axes, rows, tuple(timed), found)
 
 
 def _times_from(t0: float, given: Any, dt: float, clock: Clock, record: int) -> np.ndarray:
@@ -178,7 +200,15 @@ def check_takes(system: StateSpaceModel, given: TimesBetween, clock: Clock, reco
     """Raise if a step of the system has one length, and a time is off the grid."""
     if system.why_one_length is None:
         return
-    for name, times in (("times", given.times), ("input_times", given.breaks)):
+    if (first := np.flatnonzero(preceding(given, system.dt))).size:
+        value = _text(clock.shown(given.events.times, record)[first[0]])
+        raise ModelError(
+            f"the event at {value} must not come before the observation at its time, as this takes "
+            f"a step of length zero and {system.why_one_length}: let it come after the observation "
+            f"({BEFORE!r} of events is 0), or be one step earlier"
+        )
+    places = {"times": given.times, "input_times": given.breaks, "events": given.events.times}
+    for name, times in places.items():
         off = off_grid(times, given.t0, system.dt)
         if (off > GRID_TOLERANCE).any():
             rows = np.flatnonzero(off > GRID_TOLERANCE)
@@ -187,6 +217,8 @@ def check_takes(system: StateSpaceModel, given: TimesBetween, clock: Clock, reco
             what = f"times[{at}] = {value} is"
             if name == "input_times":
                 what = f"the change of the inputs at {value} is"
+            elif name == "events":
+                what = f"the event at {value} is"
             elif 1 < rows.size == times.size:
                 what = f"all {rows.size} rows of times, the first at {value}, are"
             raise ModelError(

@@ -22,6 +22,7 @@ from pytensor.graph.basic import Variable
 from ..errors import ModelError
 from .checks import shortened
 from .clock import Clock
+from .events import Events
 from .given_record import GivenRecord
 from .input_columns import check_inputs, only_seen, warn_of_gaps_in_sums
 from .labels import table_of
@@ -39,7 +40,8 @@ class Record(NamedTuple):
     ``system`` is the one that takes the steps of these axes; ``steps`` (J,) are the rows (J, 3) of
     a panel, ``observed`` (J, p) is None in a simulation, and ``inputs`` are (rows,
     n_input_columns). ``steps``, ``observed``, ``inputs`` and ``n_records`` may be symbols; axes and
-    records are then the current ones. ``timed`` are the inputs that have times of their own.
+    records are then the current ones. ``timed`` are the inputs that have times of their own, and
+    ``events`` those of each record.
     """
 
     system: StateSpaceModel
@@ -51,6 +53,7 @@ class Record(NamedTuple):
     observed: Any
     inputs: Any
     timed: tuple[TimedInputs, ...]
+    events: tuple[Events, ...]
 
     @property
     def is_panel(self) -> bool:
@@ -135,8 +138,9 @@ def read_record(
     n_records, steps = _rows(given, records, axes, begins)
     inputs = only_seen(system, inputs, steps, data)
     return Record(
-        placed.system, placed.clock, records, n_records, axes, steps, data, inputs, placed.timed
-    )
+        placed.system, placed.clock, records, n_records, axes, steps, data, inputs, placed.timed,
+        placed.events,
+    )  # fmt: skip
 
 
 def _rows(
@@ -214,8 +218,8 @@ def read_inputs(
     if records.is_panel and has_own_columns and is_symbol:
         raise ModelError(
             "panel, steps and inputs must be numbers in a panel of a system with accumulators, "
-            "which are reset at the steps of each record, with parameters that are held for "
-            "several steps, or at times off the grid, got a symbol"
+            "which are reset at the steps of each record, with events, with parameters that are "
+            "held for several steps, or at times off the grid, got a symbol"
         )
     rows = records.check_each(lambda one, axis: check_inputs(one, system, axis, steps), parts, axes)
     if len(rows) == 1 or (not has_own_columns and all(one is parts[0] for one in parts)):

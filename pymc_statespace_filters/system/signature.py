@@ -10,7 +10,9 @@ from pytensor.tensor.variable import TensorVariable
 from ..errors import ModelError
 from .checks import is_integer
 from .drift import DriftingParameter
-from .equations import Equation
+from .equations import RESERVED, Equation, read_equation
+
+TIME, BEFORE = "time", "before"  # columns of a table of events, see `events`
 
 
 @dataclass(frozen=True)
@@ -131,6 +133,36 @@ def checked_names(
     if default is not None and len(names) != len(default):
         raise ModelError(f"{role} must name {len(default)} components, got {list(names)}")
     return tuple(names)
+
+
+def checked_events(event: Any, events: Sequence[str]) -> tuple[str, ...]:
+    """The names of the numbers of an event, which are arguments of its function."""
+    names = checked_names("events", events, None)
+    if event is None:
+        if names:
+            raise ModelError(
+                f"event must be the function that changes the state, with the arguments "
+                f"{list(names)}, got None"
+            )
+        return names
+    reserved = {**RESERVED, TIME: "the times of events", BEFORE: "their order"}
+    if taken := [name for name in names if name in reserved]:
+        raise ModelError(
+            f"events must not have the name {taken[0]!r}, which is that of {reserved[taken[0]]}"
+        )
+    own = read_equation("event", event, ("x", "u", "t", *names)).symbols
+    if missing := [name for name in names if name not in own]:
+        raise ModelError(f"events must name arguments of event, got {missing[0]!r}, which is none")
+    return names
+
+
+def check_names_of_events(events: Sequence[str], parameters: Sequence[str]) -> None:
+    """Raise if the number of an event is an argument of another function."""
+    if shared := [name for name in events if name in parameters]:
+        raise ModelError(
+            f"{shared[0]!r} must be a number of events, which event alone has as an argument, or a "
+            "parameter of another function, got both: rename one"
+        )
 
 
 def names_of_states(role: str, names: Sequence[str], states: tuple[str, ...]) -> tuple[str, ...]:

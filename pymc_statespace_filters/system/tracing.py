@@ -64,13 +64,14 @@ class Functions:
     initial_mean: Any
     initial_cov: Any
     initial_dist: Equation | None
+    event: Equation | None
 
     @property
     def equations(self) -> list[Equation]:
         """The user's functions, in the order in which their parameters are listed."""
         others = (
             self.process_noise, self.process_dist, self.initial_mean, self.initial_cov,
-            self.initial_dist,
+            self.initial_dist, self.event,
         )  # fmt: skip
         found = [other for other in others if isinstance(other, Equation)]
         return [*self.transition.equations, *self.observation.equations, *found]
@@ -78,7 +79,7 @@ class Functions:
     @property
     def equations_of_steps(self) -> list[Equation]:
         """The user's functions that hold at every step, and not at the start alone."""
-        others = [self.process_noise, self.process_dist]
+        others = [self.process_noise, self.process_dist, self.event]
         found = [other for other in others if isinstance(other, Equation)]
         return [*self.transition.equations, *self.observation.equations, *found]
 
@@ -175,8 +176,13 @@ def read(
     initial_mean: Any,
     initial_cov: Any,
     initial_dist: Callable | None,
+    event: Callable | None,
+    events: Sequence[str],
 ) -> Functions:
-    """Check the functions of a system one by one; nothing is called."""
+    """Check the functions of a system one by one; nothing is called.
+
+    ``events`` are the names of the numbers of an event.
+    """
     check_start(initial_mean, initial_cov, initial_dist)
     return Functions(
         _read_transition(transition, process_noise, process_dist, dt),
@@ -186,6 +192,7 @@ def read(
         None if initial_mean is None else read_initial_mean(initial_mean),
         read_covariance("initial_cov", initial_cov),
         None if initial_dist is None else read_equation("initial_dist", initial_dist, ""),
+        None if event is None else read_equation("event", event, ("x", "u", "t", *events)),
     )
 
 
@@ -196,6 +203,7 @@ def size(
     *,
     n_accumulators: int = 0,
     at_any_times: bool = False,
+    events: Sequence[str] = (),
 ) -> Symbols:
     """Make the symbols, parameters first: the lengths of the others depend on them."""
     n_theta = sum(map(size_of, signature.shapes))
@@ -207,10 +215,12 @@ def size(
         at_any_times=at_any_times,
         n_accumulators=n_accumulators,
         held_for=held_for(drifting),
+        n_of_step=0 if functions.event is None else 1 + len(events),
     )
     time = pt.tensor("t", shape=(), dtype="float64")
     state, x = _longer("x", start.mean.type.shape[0], len(drifting))
     values |= {"x": x, "u": row.of_user, "t": time if row.time is None else row.time}
+    values |= {name: row.columns[i] for i, name in enumerate(events, 1)}
     now = values_now(drifting, values, state[x.type.shape[0] :])
     drawn = None
     if functions.process_dist is not None:
@@ -239,7 +249,8 @@ def trace(
 ) -> tuple[Equations, TracedObservation]:
     """Call the functions with the symbols, and freeze what they return.
 
-    A step begins from the state in which the accumulators, given by their indices, are reset.
+    A step begins from the state in which the accumulators, given by their indices, are reset, and
+    which an event has then changed.
     """
     values, theta, u = symbols.values, symbols.theta, symbols.input_row.whole
     functions = _of_length(functions, symbols)
@@ -254,7 +265,7 @@ def trace(
     def frozen(role: str, output: TensorVariable | None) -> FrozenFunctionGraph | None:
         return None if output is None else freeze(inputs, [output], role)
 
-    begin = reset(symbols.state, u, accumulators)
+    begin = _after_event(functions, symbols, reset(symbols.state, u, accumulators))
     transition, gaussian_transition = (
         freeze(inputs, graph_replace([step], {symbols.state: begin}, strict=False), "transition")
         for step in _steps(functions, symbols)
@@ -275,6 +286,17 @@ def trace(
         others_are_gaussian=start.given is None or start.given.others_are_gaussian,
     )
     return _with_finite_step(equations, functions, symbols, inputs, begin), seen
+
+
+def _after_event(functions: Functions, symbols: Symbols, state: TensorVariable) -> TensorVariable:
+    """The state from which a step begins, with its drifting parameters, which no event changes."""
+    if functions.event is None:
+        return state
+    n = symbols.n_written
+    changed = as_vector("event", functions.event(symbols.values), n)
+    (changed,) = graph_replace([changed], {symbols.state: state}, strict=False)
+    is_event = pt.gt(symbols.input_row.columns[0], 0.5)
+    return pt.set_subtensor(state[:n], pt.switch(is_event, changed, state[:n]))
 
 
 def _with_finite_step(

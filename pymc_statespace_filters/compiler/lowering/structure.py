@@ -219,7 +219,13 @@ def _is_smooth(
         (values,) = unrolled(Graph(symbols, [vector]))
     except NotUnrollableError:
         return False
-    return not any(isinstance(e.op, KINKED) for e in depends_on(values, frozenset(inputs)))
+    dependent = depends_on(values, frozenset(inputs))
+    return not any(isinstance(e.op, KINKED) and not _is_fixed(e, dependent) for e in dependent)
+
+
+def _is_fixed(expression: Expression, dependent: set[Expression]) -> bool:
+    """Whether it is a switch that does not move, as that between an event and none."""
+    return isinstance(expression.op, ps.Switch) and expression.args[0] not in dependent
 
 
 def step_moments(system: StateSpaceModel, symbols: Mapping[str, TensorVariable]) -> TensorVariable:
