@@ -39,6 +39,11 @@ GROUPS = {
         "compartments.euler_multinomial",
         "compartments.gamma_white_noise",
     ),
+    "Pharmacometrics": (
+        "pharmacometrics.read_events",
+        "pharmacometrics.normal_error",
+        "pharmacometrics.log_normal_error",
+    ),
     "Filters": (
         "EKF",
         "UKF",

@@ -1,4 +1,4 @@
-from . import compartments, errors, mechanics
+from . import compartments, errors, mechanics, pharmacometrics
 from .diagnostics import (
     check_filter,
     compute_log_likelihood,
@@ -120,6 +120,7 @@ __all__ = [
     "nearest_steps",
     "online",
     "panel_from",
+    "pharmacometrics",
     "plot_average",
     "plot_drift",
     "plot_evidence",
