@@ -8,18 +8,23 @@ therefore compiled once per installation, and a model once for all filters.
 Arguments of an entry point are numbers and addresses of contiguous float64 or int64 data.
 """
 
+import os
 from collections import namedtuple
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from inspect import signature
+from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
 import llvmlite.binding as llvm
+from filelock import FileLock
 from llvmlite import ir
 from numba import njit, types
 from numba.core import cgutils
 from numba.core.caching import FunctionCache
 from numba.core.ccallback import CFunc
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.errors import NumbaError
 from numba.extending import intrinsic
 from pytensor import config
@@ -36,6 +41,8 @@ from .shipped_code import shipped_for
 F64_PTR = types.CPointer(types.float64)
 I64_PTR = types.CPointer(types.int64)
 
+PATIENCE = 300.0  # seconds, with another process that compiles the same function
+
 
 class _CacheByKey(FunctionCache):
     """A cache in PyTensor's folder that compares the key alone, and compiles anew what is damaged.
@@ -51,6 +58,13 @@ class _CacheByKey(FunctionCache):
         except Exception:  # whatever unpickling half a file raises, at every start again
             self.flush()
         return found or self._shipped(sig, target_context)
+
+    def is_there(self, target_context) -> bool:
+        """Whether there are files of the function, in the folder or with the package."""
+        if os.path.exists(self._cache_file._index_path):
+            return True
+        code = shipped_for(target_context.codegen().magic_tuple())
+        return code is not None and self._cache_file._index_name in code.checksums
 
     def _shipped(self, signature, context):
         code = shipped_for(context.codegen().magic_tuple())
@@ -86,6 +100,32 @@ def njit_cached(function: Callable) -> Any:
 def _cache(function: Callable, key: str) -> _CacheByKey:
     CACHED_SRC_FUNCTIONS[function] = key
     return _CacheByKey(function)
+
+
+@contextmanager
+def _one_process(compiled: Any) -> Iterator[None]:
+    """Have one process compile what is not kept yet; the others wait, and find its file.
+
+    The lock is the operating system's: it ends with its process, however that ends. Without it
+    processes compile the same function, each for itself: where the folder has no locks or cannot be
+    written, and where the owner of the lock takes longer than `PATIENCE`.
+    """
+    cache = compiled._cache
+    if not isinstance(cache, _CacheByKey) or cache.is_there(compiled._targetdescr.target_context):
+        yield
+        return
+    path = Path(f"{cache._cache_file._index_path}.lock")
+    # Numba's lock first: a thread has it while it compiles, and may then come to other functions.
+    with global_compiler_lock, ExitStack() as stack:
+        with suppress(OSError):
+            stack.enter_context(FileLock(path, PATIENCE, fallback_to_soft=False))
+            stack.callback(_remove, path)
+        yield
+
+
+def _remove(path: Path) -> None:
+    with suppress(OSError):  # on Windows a file that is open cannot be removed
+        path.unlink()
 
 
 class EntryPoint:
@@ -155,10 +195,10 @@ class EntryPoint:
         for needed in self._needs:
             needed.compile()
         compiled = self._callback()
-        # LLVM calls Python, where an interrupt would be lost.
-        with held_interrupts(), slow_compilation(self._name):
+        with slow_compilation(self._name), _one_process(compiled):
             try:
-                compiled.compile()
+                with held_interrupts():  # LLVM calls Python, where an interrupt would be lost
+                    compiled.compile()
             except NumbaError as error:
                 if outside := [f for f in parts if callable(f) and is_outside(f)]:
                     raise ModelError(_explained(self._name, outside, error)) from error

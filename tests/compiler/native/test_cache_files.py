@@ -1,10 +1,13 @@
 """Compiled code on disk: files that are damaged, folders that cannot be written."""
 
+import errno
 import os
 import subprocess
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 from pickle import UnpicklingError
+from threading import Timer
 from types import FunctionType
 from uuid import uuid4
 
@@ -25,8 +28,7 @@ def _nothing(n):
 
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
 def test_a_damaged_file_is_compiled_anew(ending):
-    inside = FunctionType(_nothing.__code__, {"__name__": entry_point.__name__}, "_nothing")
-    point = EntryPoint(inside, {"n": types.intp}, "nothing", (uuid4().hex,))
+    point = made()
     folder = Path(config.base_compiledir, "numba")
     before = set(folder.iterdir())
     point.compile()
@@ -39,11 +41,13 @@ def test_a_damaged_file_is_compiled_anew(ending):
     assert len(file.read_bytes()) > 0.9 * len(whole)  # for the next process
 
 
-def test_it_is_known_what_needs_no_compilation():
-    def made(needs=()):
-        inside = FunctionType(_nothing.__code__, {"__name__": entry_point.__name__}, "_nothing")
-        return EntryPoint(inside, {"n": types.intp}, "nothing", (uuid4().hex,), needs)
+def made(needs=()):
+    """An entry point that nobody has compiled."""
+    inside = FunctionType(_nothing.__code__, {"__name__": entry_point.__name__}, "_nothing")
+    return EntryPoint(inside, {"n": types.intp}, "nothing", (uuid4().hex,), needs)
 
+
+def test_it_is_known_what_needs_no_compilation():
     needed = made()
     point = made([needed])
     assert not needed.is_compiled
@@ -56,6 +60,62 @@ def test_it_is_known_what_needs_no_compilation():
     entry_point._compiled.pop(point.symbol, None)
     assert not made([other]).is_compiled
     assert other.symbol not in entry_point._compiled
+
+
+HOLD = """
+import sys, time
+from filelock import FileLock
+lock = FileLock(sys.argv[1])
+lock.acquire()
+print("held", flush=True)
+time.sleep(600.0)
+"""
+
+
+@pytest.fixture
+def owner():
+    """A function that starts a process which holds the lock of an entry point."""
+    with ExitStack() as stack:
+
+        def owner(point):
+            path = f"{point._callback()._cache._cache_file._index_path}.lock"
+            process = subprocess.Popen([sys.executable, "-c", HOLD, path], stdout=subprocess.PIPE)
+            stack.enter_context(process)
+            stack.callback(process.kill)
+            assert process.stdout.readline() == b"held\n"
+            return process, Path(path)
+
+        yield owner
+
+
+def test_who_waits_for_a_process_that_is_killed_compiles(owner):
+    point = made()
+    process, path = owner(point)
+    timer = Timer(0.2, process.kill)
+    timer.start()
+    point.compile()
+    timer.join()  # it was not compiled before
+    assert process.wait(LIMIT) != 0
+    assert not path.exists()
+
+
+def test_patience_with_another_process_ends(owner, monkeypatch):
+    monkeypatch.setattr(entry_point, "PATIENCE", 0.1)
+    point = made()
+    process, path = owner(point)
+    point.compile()
+    assert process.poll() is None
+    assert path.exists()  # for others who wait
+
+
+def test_without_locks_each_process_compiles(monkeypatch):
+    def no_lock(*arguments, **options):
+        raise OSError(errno.ENOLCK, "no locks")
+
+    monkeypatch.setattr(entry_point.FileLock, "acquire", no_lock)
+    point = made()
+    point.compile()
+    assert point.is_compiled
 
 
 def test_a_damaged_file_of_a_module_is_compiled_anew(tmp_path, monkeypatch):
