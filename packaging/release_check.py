@@ -37,11 +37,11 @@ TESTS = (
     "tests/compiler/native",
     "tests/system/test_model.py",
     "tests/filters/test_truth_ekf.py",
-    "tests/filters/test_truth_unbiased.py",
+    "tests/filters/test_bootstrap_page.py",
     "tests/evaluation/test_log_likelihood.py",
     "tests/evidence/test_bridge.py",
     "tests/sampling/test_checkpoint_file.py",
-    "tests/sampling/test_folder_lease.py",
+    "tests/sampling/test_checkpoint_folder.py",
     "tests/sampling/test_interrupts.py",
     "tests/sampling/test_run_models.py",
 )

@@ -83,11 +83,17 @@ def test_workflows_have_every_python_that_is_promised():
     assert set(matrix["python"]) == classified
 
 
+CHECK = runpy.run_path(str(ROOT / "packaging" / "release_check.py"))
+
+
+def test_the_release_check_runs_tests_that_exist():
+    assert [path for path in CHECK["TESTS"] if not (ROOT / path).exists()] == []
+
+
 def test_a_wheel_that_has_grown_fails_the_release_check(tmp_path, capsys):
     """The quick part of the check, which builds both distributions, is a step of .ci/run."""
     assert "make release-quick" in text_of(".ci/run")
-    check = runpy.run_path(str(ROOT / "packaging" / "release_check.py"))
     wheel = tmp_path / "pymc_statespace_filters-0.1.0-py3-none-any.whl"
-    wheel.write_bytes(bytes(check["MAX_WHEEL_BYTES"]))
+    wheel.write_bytes(bytes(CHECK["MAX_WHEEL_BYTES"]))
     with pytest.raises(SystemExit, match=f"{wheel.name} has 1350000 bytes, not below 1350000"):
-        check["check_wheel"](wheel)
+        CHECK["check_wheel"](wheel)
