@@ -10,7 +10,7 @@ from .collapse import collapse_remedies
 from .filter_check import filters_of
 from .missed import missed_of
 from .mixing import mixing_problem, until_ess_problem
-from .mobility import LOWER, STANDSTILL, chain_problems
+from .mobility import GROWTH, LOWER, STANDSTILL, chain_problems
 from .noise import variance_advice
 from .remedies import ways_to_mix
 from .report import closing_report
@@ -21,7 +21,8 @@ from .words import log, sentences, told
 def _(fact: EndedDram, begin: str) -> list[str]:
     of_chains = chain_problems(fact)
     said = [*of_chains.values(), *_noise(fact)]
-    if fact.options.compute_convergence_checks and "posterior" in fact.tree:
+    is_looked_at = fact.options.compute_convergence_checks and "posterior" in fact.tree
+    if is_looked_at and GROWTH not in of_chains:  # draws that mean nothing lack nothing
         said += missed_of(fact)
     check = filters_of(fact)
     # An estimate may be far too high by chance: the level says nothing of one with noise.
@@ -31,7 +32,7 @@ def _(fact: EndedDram, begin: str) -> list[str]:
             f"{fact.below:.0f} nats or more below that of the points which the search for starts "
             "has found. Tune longer, or start there (initvals=psf.find_starts())."
         )
-    elif fact.chains and of_chains.keys().isdisjoint({STANDSTILL, LOWER}):  # which explain it
+    elif fact.chains and of_chains.keys().isdisjoint({STANDSTILL, LOWER, GROWTH}):
         said += _mixing(fact)
     said += _left_out(fact)
     report = closing_report(fact) if fact.chains else ""

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
+from ..pymc_model.prior import can_sample
 from ..sampling.output.convergence import MAX_RHAT, Convergence
 from ..sampling.output.facts import EndedRun
 from ..sampling.run.stopping import ENOUGH, is_enough, shows
@@ -30,8 +31,12 @@ def mixing_problem(fact: EndedRun, ways: Ways) -> str | None:
     is_mixed = found.rhat.max() <= MAX_RHAT
     what = "The draws are worth too little" if is_mixed else "The chains have not mixed"
     text = f"{what}: {found.described(fact.names)}. "
+    if endless := _endless(fact, found):
+        return f"{text}{endless[0].upper()}{endless[1:]}."
     if found.least_ess < enough:
-        text += f"{_needed(fact, found, enough)} (until_ess={enough:g} does it). "
+        is_asked = (request.until_ess or 0.0) >= enough  # and the user has ended it
+        does_it = "" if is_asked else f" (until_ess={enough:g} does it)"
+        text += f"{_needed(fact, found, enough)}{does_it}. "
     if not is_mixed:
         remedy = alternatives(ways(fact.names[int(found.rhat.argmax())]))
         text += f"If R-hat stays above {MAX_RHAT}, {remedy}."
@@ -57,6 +62,8 @@ def until_ess_problem(fact: EndedRun, ways: Ways, remedy: str = "") -> str | Non
 
 def _remedy(fact: EndedRun, enough: float, ways: Sequence[str]) -> str:
     request, length, found = fact.request, fact.length, fact.convergence
+    if found is not None and (endless := _endless(fact, found)):
+        return endless
     if not shows(request, enough):
         return f"give more draws: {request.chains} * {request.draws} hardly show so many"
     would_do = "" if found is None else f"{_needed(fact, found, enough)}; "
@@ -72,6 +79,17 @@ def _remedy(fact: EndedRun, enough: float, ways: Sequence[str]) -> str:
     if 2.0 * request.chains * fact.seconds < request.seconds:
         ended = ""
     return f"{would_do}{ended}{alternatives([more, *ways])}"
+
+
+def _endless(fact: EndedRun, found: Convergence) -> str:
+    """That priors without an end may be why chains disagree, and what to do; empty if not."""
+    priors = [rv.name for rv in fact.model.free_RVs if not can_sample(rv, fact.model)]
+    if not priors or found.rhat.max() <= MAX_RHAT:
+        return ""
+    return (
+        f"the prior of {', '.join(priors)} is improper: what the data leave undetermined spreads "
+        "without end, however many iterations there are; give a proper prior"
+    )
 
 
 def _needed(fact: EndedRun, found: Convergence, enough: float) -> str:

@@ -1,10 +1,12 @@
 """What went wrong in single chains: they stand still, run away, fail, or are lower than others."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 from ..filters.outcomes import COLLAPSED, Failure
 from ..sampling.output.chain_bars import MIN_ACCEPT_RATE
+from ..sampling.output.convergence import MAX_RHAT
 from ..sampling.output.facts import EndedChain, EndedDram
 from ..sampling.output.phase_statistics import PhaseStatistics
 from ..sampling.target.record_target import RecordTarget
@@ -30,7 +32,7 @@ TOLERATED_COLLAPSES = 0.5
 
 
 # Causes that explain why chains have not mixed.
-STANDSTILL, LOWER = "standstill", "lower"
+STANDSTILL, LOWER, GROWTH = "standstill", "lower", "growth"
 
 
 class Problem(NamedTuple):
@@ -51,16 +53,19 @@ def chain_problems(fact: EndedDram) -> dict[str, str]:
     """What is wrong with single chains, by its cause: one message for all chains that have it."""
     lower = {low.chain: low for low in fact.lower}
     by_cause: dict[str, dict[int, str]] = {}
+    found = fact.convergence
+    is_mixed = found is not None and found.rhat.max() <= MAX_RHAT
     for i, chain in fact.chains.items():
-        problem = _problem(chain)
+        # Chains that agree do not spread without end: a scale is large.
+        problem = _problem(replace(chain, growth=None) if is_mixed else chain)
         if problem is not None:
             by_cause.setdefault(problem.cause, {})[i] = problem.message
         elif i in lower:
             by_cause.setdefault(LOWER, {})[i] = ""
-    found = {cause: _of_chains(texts) for cause, texts in by_cause.items()}
+    texts = {cause: _of_chains(of_cause) for cause, of_cause in by_cause.items()}
     if LOWER in by_cause:
-        found[LOWER] = _lower_text([lower[i] for i in by_cause[LOWER]])
-    return found
+        texts[LOWER] = _lower_text([lower[i] for i in by_cause[LOWER]])
+    return texts
 
 
 def _problem(chain: EndedChain) -> Problem | None:
@@ -74,7 +79,7 @@ def _problem(chain: EndedChain) -> Problem | None:
         "screen": _screen_problem(statistics),
         "collapse": _collapse_problem(statistics, remedy),
         STANDSTILL: _mobility_problem(statistics, is_noisy=bool(remedy)),
-        "growth": _growth_problem(chain.growth),
+        GROWTH: _growth_problem(chain.growth),
         "failures": _failure_problem(statistics),
     }
     found = (Problem(cause, text) for cause, text in messages.items() if text is not None)

@@ -1,4 +1,4 @@
-"""The check of integration steps at the end of a run: whether they move the posterior.
+"""The check of integration steps at the end of a run: whether they move posterior or evidence.
 
 First the steps are looked at along paths without noise, which costs next to nothing; densities are
 compiled only where steps half as long are others.
@@ -7,13 +7,13 @@ compiled only where steps half as long are others.
 import numpy as np
 from numpy.typing import NDArray
 from pymc.model import Model
-from scipy.special import softmax
+from scipy.special import logsumexp, softmax
 from xarray import DataTree
 
 from ..errors import ModelError
 from ..pymc_model.density import RowFunction
 from ..pymc_model.inspection import noisy_filters
-from ..pymc_model.posterior_draws import unconstrained_draws
+from ..pymc_model.posterior_draws import STEP_NATS, unconstrained_draws
 from ..pymc_model.step_refinement import densities_by_halvings, step_accuracy, step_lengths
 
 _N_POINTS, _N_DRAWS = 10, 200
@@ -29,7 +29,10 @@ Array = NDArray[np.float64]
 
 
 def step_problems(tree: DataTree, model: Model) -> list[str]:
-    """Say which integration steps are that are too long for the equations at the draws."""
+    """Say which integration steps are that are too long for the equations at the draws.
+
+    By how many nats half the step changes the evidence is stored with the draws.
+    """
     accuracy = step_accuracy(model)
     if accuracy is None:
         return []
@@ -47,7 +50,9 @@ def step_problems(tree: DataTree, model: Model) -> list[str]:
             " Take LocalLinearization, which follows fast decays with long steps, or, where the "
             "noise depends on the state, multiply substeps by four until this warning is gone."
         ]
-    if (shift := _shift(model, _some(draws, _N_DRAWS))) >= _MOST_SHIFT:
+    shift, nats = _changes(model, _some(draws, _N_DRAWS))
+    tree.attrs[STEP_NATS] = nats
+    if shift >= _MOST_SHIFT:
         return [
             f"{too_long}: with steps half as long the posterior would move by {shift:.1f} standard "
             "deviations or more. Multiply substeps by four until this warning is gone, or take an "
@@ -57,26 +62,29 @@ def step_problems(tree: DataTree, model: Model) -> list[str]:
     return []
 
 
-def _shift(model: Model, x: Array) -> float:
-    """How far draws (n, k) move by half the step, in standard deviations; 0 if that is unknown.
+def _changes(model: Model, x: Array) -> tuple[float, float]:
+    """How far draws (n, k) move by half the step, in standard deviations, and the log-evidence.
 
-    With a noisy filter it is: others than the filter of the draws may be far off.
+    Both are 0 if that is unknown, as with a noisy filter: others than the filter of the draws may
+    be far off.
     """
+    nothing = 0.0, 0.0
     if noisy_filters(model):
-        return 0.0
+        return nothing
     try:
         densities = densities_by_halvings(model, 1)
     except ModelError:  # a filter that does not take the system with substeps
-        return 0.0
+        return nothing
     coarse, fine = (RowFunction(model, density).evaluate(x) for density in densities)
     is_known = np.isfinite(coarse)
     if not (is_known & np.isfinite(fine)).any():
-        return 0.0
-    weights = softmax((fine - coarse)[is_known])
+        return nothing
+    change = (fine - coarse)[is_known]
+    weights, nats = softmax(change), logsumexp(change) - np.log(change.size)
     mean, spread = x[is_known].mean(axis=0), x[is_known].std(axis=0)
     varies = spread > _ROUNDING * np.abs(mean)
     moved = np.abs(weights @ x[is_known] - mean)[varies] / spread[varies]
-    return float(np.nan_to_num(moved).max(initial=0.0))
+    return float(np.nan_to_num(moved).max(initial=0.0)), float(nats)
 
 
 def _some(draws: Array, count: int) -> Array:

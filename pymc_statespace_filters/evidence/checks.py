@@ -32,7 +32,7 @@ from scipy.stats import rankdata
 from ..errors import ModelError
 from ..pymc_model.density import RowFunction
 from ..pymc_model.elements import labels_of
-from ..pymc_model.posterior_draws import STEP_CHECK, are_populations
+from ..pymc_model.posterior_draws import STEP_CHECK, STEP_NATS, are_populations
 from ..pymc_model.step_refinement import densities_by_halvings, step_stability
 from ..statistics.lower_chains import lower_chains
 from .observed_data import scalar_count
@@ -42,6 +42,8 @@ MAX_RHAT = 1.05
 # Effective draws of all chains with which R-hat and ESS are reliable (Vehtari et al. 2021).
 ENOUGH_EFFECTIVE = 400
 
+# By which half the step may change the log-evidence: odds of 5 to 3.
+MOST_NATS = 0.5
 N_DRAWS = 100
 MIN_DRAWS = 2  # affected; a single one may be chance
 LOSS = 5.0  # nats per point, by halving the steps
@@ -98,6 +100,11 @@ def check_steps(model: pm.Model, idata: xr.DataTree, draws: Array) -> list[str]:
     found = list(check_discretisation(model, idata, draws))
     if not found and (known := idata.attrs.get(STEP_CHECK)):
         found = [f"{known[0].lower()}{known[1:].rstrip('.')}"]
+    elif not found and abs(nats := idata.attrs.get(STEP_NATS, 0.0)) > MOST_NATS:
+        found = [
+            f"with integration steps half as long the log-evidence changes by {nats:+.1f} nats: "
+            f"multiply substeps by four until step_error finds less than {MOST_NATS:g}"
+        ]
     return found
 
 

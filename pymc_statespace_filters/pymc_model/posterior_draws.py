@@ -20,7 +20,9 @@ from ..errors import DataMismatchError, ModelError
 
 MIN_DRAWS = 20
 STATES = "sampler_state"  # the group of the last states of chains
-STEP_CHECK = "step_check"  # attribute: what the end of a run says of integration steps
+# Attributes: what the end of a run says of integration steps, and by how many nats the evidence
+# changes with steps half as long, if that was computed.
+STEP_CHECK, STEP_NATS = "step_check", "step_nats"
 # Values of the attribute ``sampler`` of draws.
 BY_PARTICLES = "smc"  # their filter may not be that of the model
 COURSE = "smc"  # group with the course of their run

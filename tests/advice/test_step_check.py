@@ -11,6 +11,8 @@ import xarray as xr
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.advice.step_check import step_problems
 from pymc_statespace_filters.errors import EvidenceWarning
+from pymc_statespace_filters.evidence.checks import check_steps
+from pymc_statespace_filters.pymc_model.posterior_draws import unconstrained_draws
 
 
 def decay(dt, integrator=psf.EulerMaruyama, **options):
@@ -74,6 +76,30 @@ def test_draws_that_do_not_vary_tell_nothing(record):
         observed = record["observations"]
         psf.StateSpace("d", decay(0.5), psf.EKF(), steps=range(1, 101), observed=observed)
     assert step_problems(xr.DataTree.from_dict({"posterior": stuck}), model) == []
+
+
+@pytest.mark.parametrize(("substeps", "is_said"), [(2, True), (8, False)])
+def test_steps_that_decide_a_comparison_are_a_doubt_of_the_evidence(record, substeps, is_said):
+    """They move no parameter; the change is that of log-likelihoods with either step."""
+    known, observed = {"k": 3.0, "s": 1.0}, record["observations"]
+    with pm.Model() as model:
+        noise = pm.HalfNormal("unrelated", 1.0)
+        steps = decay(0.5, substeps=substeps)
+        psf.StateSpace("d", steps, psf.EKF(), params=known, steps=range(1, 101), observed=observed)
+        pm.Normal("y", 0.0, noise, observed=1.0)
+    draws = xr.Dataset({"unrelated": (("chain", "draw"), np.linspace(0.9, 2, 200).reshape(2, 100))})
+    tree = xr.DataTree.from_dict({"posterior": draws})
+    assert step_problems(tree, model) == []
+    doubts = check_steps(model, tree, unconstrained_draws(tree, model))
+    assert bool(doubts) == is_said
+    if is_said:
+        given = {"steps": range(1, 101), "observed": observed}
+        coarse, fine = (
+            psf.log_likelihood(decay(0.5, substeps=n), psf.EKF(), known, **given).sum()
+            for n in (substeps, 2 * substeps)
+        )
+        assert abs(fine - coarse) > 1.0
+        assert f"the log-evidence changes by {fine - coarse:+.1f} nats" in doubts[0]
 
 
 def stiff(integrator=psf.EulerMaruyama, **options):

@@ -62,7 +62,8 @@ def test_the_advice():
     assert way.startswith("sample stiffness as it is, whose logarithm")
     found = Convergence(np.array([900.0]), np.array([900.0]), np.array([1.02]))
     request = SimpleNamespace(chains=4, draws=1000, doubles_thin=False)
-    ended = SimpleNamespace(request=request, convergence=found, names=["stiffness"])
+    names, model = ["stiffness"], pm.Model()
+    ended = SimpleNamespace(request=request, convergence=found, names=names, model=model)
     assert mixing_problem(ended, lambda name: [way]).endswith(
         f"(stiffness). If R-hat stays above 1.01, {way}."
     )
@@ -80,6 +81,7 @@ def test_chains_that_cannot_go_on_are_not_told_to():
     )
     length = SimpleNamespace(n_iterations=2000)
     ended = {"request": request, "length": length, "convergence": found, "names": ["a"]}
+    ended |= {"model": pm.Model()}
     for goes_on, way in ((True, "continue_from=idata"), (False, "until_ess=None), which has no")):
         fact = SimpleNamespace(**ended, seconds=200.0, goes_on=goes_on)
         text = until_ess_problem(fact, lambda name: [])

@@ -2,6 +2,7 @@
 
 import logging
 import re
+from functools import partial
 
 import numpy as np
 import pymc as pm
@@ -31,10 +32,10 @@ def report_of(caplog):
     return run
 
 
-def two_modes(gap, width=1.0):
+def two_modes(gap, width=1.0, prior=pm.Flat):
     """Modes at 0 and at 1000, the second so wide and so many nats lower."""
     with pm.Model() as model:
-        x = pm.Flat("x")
+        x = prior("x")
         second = -gap - 0.5 * ((x - 1000.0) / width) ** 2
         pm.Potential("modes", pt.switch(x < 500.0, -0.5 * x**2, second))
     return model
@@ -103,12 +104,35 @@ def test_chains_share_a_warm_up_which_leads_out_of_a_lower_mode(report_of):
 
 
 def test_modes_of_one_height_are_no_shortfall(report_of):
-    _, _, messages = report_of(two_modes(5.0), draws=500, **IN_BOTH)
+    model = two_modes(5.0, prior=partial(pm.Normal, sigma=1e4))
+    _, _, messages = report_of(model, draws=500, **IN_BOTH)
     assert "nats" not in "".join(messages)
     (said,) = messages[:-1]
     assert re.search(r"R-hat .*stays above 1.01, draw all modes .*psf.sample_smc\(", said)
     assert "noise" not in said
     assert "particles" not in said
+
+
+def test_an_improper_prior_is_named_and_no_number_of_iterations(report_of):
+    """Whose modes `sample_smc` cannot draw."""
+    _, _, messages = report_of(two_modes(5.0), draws=500, **IN_BOTH)
+    (said,) = messages[:-1]
+    assert said.endswith(
+        "The prior of x is improper: what the data leave undetermined spreads without end, however "
+        "many iterations there are; give a proper prior."
+    )
+
+
+@pytest.mark.parametrize("width", [1e5, np.inf])
+def test_proposals_that_grow_are_the_one_cause_unless_chains_agree(report_of, width):
+    with pm.Model() as model:
+        pm.Potential("likelihood", -0.5 * (pm.Flat("x") / width) ** 2)
+    record, _, messages = report_of(model, draws=4000, tune=1000, chains=4)
+    if np.isfinite(width):
+        assert record.message.endswith(" No problems found.")
+    else:
+        (said,) = messages[:-1]
+        assert "The proposals of x have become" in said
 
 
 def test_a_stuck_chain_is_named(report_of):
