@@ -8,6 +8,7 @@ import xarray as xr
 
 from ..compiler.native.compilation import COMPILATION
 from ..errors import DataMismatchError, ModelError
+from ..filters.checks import check_system_and_filter
 from ..parallel.signals import keeps_what_is_there
 from ..pymc_model.filter_rows import Record
 from ..pymc_model.inspection import given_model
@@ -159,7 +160,9 @@ def _new_rows(
         values[n_old:], **{name: given[n_old:]}, inputs=inputs, t0=earlier.t0, events=events
     )
     found = read_record(system, new, earlier)
-    if found.system != system:
+    if found.system.has_instant_steps:
+        check_system_and_filter(found.system, rows.variable.filter)
+    if found.system.with_instant_steps(False) != system.with_instant_steps(False):
         raise ModelError(
             "times must lie on the grid of steps t0 + k*dt, as those of the run do: round with "
             "psf.nearest_steps, or run sample_smc over all rows"

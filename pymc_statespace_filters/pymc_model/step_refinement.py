@@ -15,7 +15,7 @@ from ..compiler.lowering.symbols import call, jacobian_of, symbols_of
 from ..compiler.native.rows import interpreted_at_points
 from ..errors import ModelError
 from ..ops.signatures import PANEL
-from ..system.input_columns import divided, with_resets
+from ..system.input_columns import divided, with_resets, without_events
 from ..system.integrators.substeps import CoupledNoise
 from ..system.model import StateSpaceModel
 from ..system.panel_records import FIRST_INPUT, RECORD, STEP
@@ -222,11 +222,12 @@ def _path_eigenvalues(
     eigenvalues: list[list[NDArray[np.complex128]]] = [[] for _ in systems]
     with np.errstate(all="ignore"):
         for k in range(n_steps + 1):
-            now = theta, x, inputs[:, min(k, inputs.shape[1] - 1)], t0 + k * length
+            row, t = inputs[:, min(k, inputs.shape[1] - 1)], t0 + k * length
             if k % STEPS_PER_JACOBIAN == 0 or k == n_steps:
+                of_step = without_events(system, row)
                 for found, jacobian in zip(eigenvalues, jacobians, strict=True):
-                    found.append(_eigenvalues(jacobian(*now)))
-            x = advance(*now)
+                    found.append(_eigenvalues(jacobian(theta, x, of_step, t)))
+            x = advance(theta, x, row, t)
     return [np.stack(found, axis=1) for found in eigenvalues]
 
 

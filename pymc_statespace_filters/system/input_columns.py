@@ -312,6 +312,15 @@ def columns_of_steps(system: "StateSpaceModel", rows: np.ndarray) -> np.ndarray 
     return rows[:, end - system.n_step_columns : end]
 
 
+def without_events(system: "StateSpaceModel", rows: np.ndarray) -> np.ndarray:
+    """Rows of inputs (..., n_input_columns) in which no step begins with an event."""
+    rows = rows.copy()
+    if system.events is not None:
+        end = system.n_input_columns - len(system.accumulators)
+        rows[..., end - system.n_step_columns] = 0.0
+    return rows
+
+
 def times_of_steps(system: "StateSpaceModel", inputs: Any, steps: Any, t0: Any) -> Any:
     """The times at which steps begin, from the inputs (rows, n_input_columns) of a record."""
     if system.is_at_any_times:

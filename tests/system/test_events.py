@@ -7,6 +7,10 @@ import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.pymc_model.step_refinement import step_stability
+from pymc_statespace_filters.system.given_record import GivenRecord
+from pymc_statespace_filters.system.input_columns import divided
+from pymc_statespace_filters.system.record import read_record
 
 DECAY, VOLUME, SHARE, SD = 0.7, 2.0, 0.9, 0.1
 DOSES = {"time": [1.0, 1.77, 2.5], "dose": [10.0, 5.0, 3.0]}
@@ -214,6 +218,36 @@ def test_a_run_goes_on_across_events(filter, n_first):
     )  # fmt: skip
     terms = np.concatenate([first["log_likelihood"], second["log_likelihood"]])
     np.testing.assert_array_equal(terms, whole["log_likelihood"])
+
+
+def test_a_sequential_run_goes_on_with_the_later_events_of_its_model():
+    events = {"time": [1.0, 1.77, 2.05], "dose": [10.0, 5.0, 0.1], "before": [0, 0, 1]}
+
+    def run(n_rows):
+        with pm.Model() as model:
+            pm.LogNormal("k", np.log(DECAY), 0.05)
+            params = {name: value for name, value in PARAMS.items() if name != "k"}
+            psf.StateSpace("y", COMPARTMENT, psf.EKF(), params=params, times=TIMES[:n_rows],
+                           observed=DATA[:n_rows], events=events)  # fmt: skip
+            return psf.sample_smc(30, data="sequential", random_seed=1, progressbar=False), model
+
+    whole, (part, model) = run(4)[0], run(2)
+    longer = psf.extend(part, model, observed=DATA[2:], times=TIMES[2:], progressbar=False)
+    np.testing.assert_array_equal(longer["smc"]["score"], whole["smc"]["score"])
+
+
+def test_an_event_is_of_one_part_of_a_divided_step_and_no_growth_of_a_step():
+    system = one_compartment(
+        psf.EulerMaruyama(lambda x, k: [-k * x[0]], lambda sigma: [[sigma]], dt=0.1),
+        event=lambda x, factor: [factor * x[0]], events=["factor"],
+    )  # fmt: skip
+    given = {"steps": [10, 20], "observed": [0.5, 0.4], "events": {"time": [1.0], "factor": [9.0]}}
+    rows = read_record(system, GivenRecord(**given)).inputs
+    np.testing.assert_array_equal(divided(system, rows, 3)[:, 0].nonzero()[0], [30])
+    with pm.Model() as model:
+        pm.Normal("k", 0.8)
+        psf.StateSpace("y", system, psf.EKF(), params={"sigma": 0.1, "V": 1.0, "sd": 0.1}, **given)
+    assert step_stability(model)(np.array([[0.8], [21.0]])).tolist() == [True, False]
 
 
 @pytest.fixture(scope="module")
