@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -146,7 +147,7 @@ def _key(value: Any) -> Any:
     """A label, None if there is none; tables hold integers also as floats."""
     if pd.isna(value) or value == "":
         return None
-    return int(value) if not isinstance(value, str) and value == round(value) else value
+    return int(value) if isinstance(value, Real) and value == round(value) else value
 
 
 def _check_order(table: ClinicalTable) -> None:
