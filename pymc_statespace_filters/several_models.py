@@ -96,13 +96,14 @@ def run_models(
     Returns
     -------
     dict of str to xarray.DataTree
-        As returned by the sampler; None on ranks that do not get them. After Ctrl-C those of the
-        models that have draws; a warning names the others.
+        As returned by the sampler; None on ranks that do not get them. After Ctrl-C, or an error of
+        a model whose run follows those of others, those of the models that have draws; a warning
+        names the others, with the error.
 
     Raises
     ------
     ModelError, DataMismatchError, ParallelError, CheckpointError
-        As the sampler.
+        As the sampler, if there are no draws of any model.
 
     Warns
     -----
@@ -201,7 +202,7 @@ def _one_by_one(
     comm: Any,
 ) -> dict[str, DataTree] | None:
     """Every model, with the same seed; None on ranks that do not get them."""
-    seed, found = settings.get("random_seed"), {}
+    seed, found, failed = settings.get("random_seed"), {}, dict[str, Exception]()
 
     def add(name: str, model: Model) -> None:
         # Each gets the numbers that a generator would give the first.
@@ -213,9 +214,16 @@ def _one_by_one(
             found[name] = tree
 
     for name, model in models.items():
-        unless_interrupted(partial(add, name, model), None)
+        try:
+            unless_interrupted(partial(add, name, model), None)
+        except Exception as error:
+            if comm is not None:  # other ranks may not know of it
+                raise
+            failed[name] = error
+    if failed and not found:
+        raise next(iter(failed.values()))
     if found:
         for name in models:
             if name not in found:
-                tell(WithoutDraws(name))
+                tell(WithoutDraws(name, failed.get(name)))
     return found or None

@@ -47,6 +47,9 @@ def _(fact: EndedDram, begin: str) -> list[str]:
 
 @sentences.register
 def _(fact: WithoutDraws) -> list[str]:
+    if (error := fact.error) is not None:
+        kind = type(error).__name__
+        return [f"Model {fact.name!r} ended in an error; the results lack it. {kind}: {error}"]
     return [
         f"The run was interrupted before model {fact.name!r} had a draw: the results lack this "
         "model."

@@ -239,6 +239,19 @@ def test_particles_of_each_model_as_if_alone(models):
     assert table.loc["wide", "log_evidence"] == trees["wide"].attrs["log_evidence"]
 
 
+def test_an_error_of_one_model_keeps_the_draws_of_the_others(caplog):
+    with pm.Model() as impossible:
+        pm.Potential("nowhere", -np.inf + 0 * pm.Normal("x"))
+    rivals = {"first": normal_model(), "impossible": impossible, "last": normal_model(5.0)}
+    settings = {"draws": 40, "populations": 3, "random_seed": 1, "progressbar": False}
+    trees = psf.run_models(rivals, sampler="smc", **settings)
+    alone = psf.sample_smc(model=rivals["last"], **settings)
+    assert list(trees) == ["first", "last"]
+    assert trees["last"]["posterior"].to_dataset().equals(alone["posterior"].to_dataset())
+    (said,) = [r.message for r in caplog.records if "lack it" in r.message]
+    assert re.match(r"Model 'impossible' ended in an error; .* ModelError: the likelihood", said)
+
+
 def test_samplers_and_arguments_of_sample(caplog):
     """Of each model as if alone, with its name in all that is said."""
     rivals = {"narrow": normal_model(), "wide": normal_model(5.0)}

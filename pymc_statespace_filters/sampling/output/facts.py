@@ -69,9 +69,10 @@ class NoisyStart(ChainFact):
 
 @dataclass(frozen=True)
 class WithoutDraws(ChainFact):
-    """A model that the results of an interrupted run lack."""
+    """A model that the results of a run lack, which was interrupted or has ended in an error."""
 
     name: str
+    error: Exception | None = None
 
 
 @dataclass(frozen=True)
