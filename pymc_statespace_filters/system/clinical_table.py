@@ -3,14 +3,13 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from numbers import Real
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from ..errors import ModelError
-from .checks import shortened
+from .checks import is_finite, shortened
 from .clock import are_dates
 from .panel_records import Records, records_of
 
@@ -147,7 +146,7 @@ def _key(value: Any) -> Any:
     """A label, None if there is none; tables hold integers also as floats."""
     if pd.isna(value) or value == "":
         return None
-    return int(value) if isinstance(value, Real) and value == round(value) else value
+    return int(value) if is_finite(value) and value == round(value) else value
 
 
 def _check_order(table: ClinicalTable) -> None:
