@@ -27,6 +27,7 @@ from .results import (
     truth_of,
     variable_of,
 )
+from .visual_predictive_check import picture_in_bins, pooled
 
 PAST = 2.0  # length of the observations shown, in lengths of the forecast
 MIN_PAST = 10  # observations
@@ -46,6 +47,8 @@ def plot_forecast(
     n_past: int | None = None,
     transform: Callable[[Any], Any] | Mapping[str, Callable[[Any], Any]] | None = None,
     errors: bool = False,
+    bins: Any = None,
+    corrected: bool = False,
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> PlotCollection:
@@ -57,6 +60,11 @@ def plot_forecast(
     noise and the observation noise, those of a forecast that of the states. A vertical line marks
     the last observation. Of a panel, each record has panels of its own. Units are taken from the
     results as in `plot_states`.
+
+    With `bins` it is a visual predictive check of all records together: in each bin of time the
+    percentiles 5, 50 and 95 of the data, and the median and 90 % band of each of these percentiles
+    over replicated data sets. Of a panel with random effects, these are data of new records only
+    if the random effects are drawn anew, by ``sample_vars`` of ``pm.sample_posterior_predictive``.
 
     Parameters
     ----------
@@ -87,6 +95,15 @@ def plot_forecast(
     errors : bool
         Show observation minus median prediction, with the bands around zero. The observations are
         those at the times of the predictions: `truth`, and the record beside a free run.
+    bins : int or sequence of numbers or dates, optional
+        Number of bins with about equally many rows of the data, where rows of one time share a bin;
+        or their edges, each bin with its lower edge and the last one with both. The group is then
+        "posterior_predictive" or "prior_predictive", and all records are shown by default.
+    corrected : bool
+        In `bins`, multiply each value by the median prediction of its bin over the prediction of
+        its row [1]_, so that records with different doses or covariates may be pooled. The
+        prediction of a row is the median of its replicates, where the source takes a record without
+        random effects. Data and predictions must be positive.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
         Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
@@ -96,13 +113,25 @@ def plot_forecast(
     -------
     arviz_plots.PlotCollection
         Visuals ``band_90``, ``band_50`` and ``median`` (of a single time ``bar_90`` and
-        ``bar_50``), ``data``, ``end``, ``truth``, ``errors``, along ``observable``.
+        ``bar_50``), ``data``, ``end``, ``truth``, ``errors``, along ``observable``. With `bins`:
+        ``band_5``, ``median_5``, ``data_5`` and those of 50 and 95, and the points ``data``.
 
     Raises
     ------
     ModelError
         If there is no forecast, the truth or the transform does not match it, or `errors` has no
-        observations.
+        observations; if `bins` have no data, or there is no posterior beside a replicated panel.
+
+    Warns
+    -----
+    ModelWarning
+        If what differs between the records of a panel is not drawn anew in `bins`.
+
+    References
+    ----------
+    .. [1] M. Bergstrand, A. C. Hooker, J. E. Wallin and M. O. Karlsson (2011). Prediction-corrected
+       visual predictive checks for diagnosing nonlinear mixed-effects models. *AAPS Journal* 13,
+       143-151. doi:10.1208/s12248-011-9255-z
 
     Examples
     --------
@@ -127,12 +156,23 @@ def plot_forecast(
     """
     if n_past is not None:
         check_count("n_past", n_past, 0)
-    group, results = group_of(idata, *((group,) if group else GROUPS))
+    groups = (group,) if group else GROUPS if bins is None else GROUPS[2:]
+    group, results = group_of(idata, *groups)
     name = variable_of(predicted(results), var_name)
     labels = _labels_of_records(idata, name, model)
-    rows = rows_of(idata, results, name, name, labels).choose("records", records)
-    draws = rows.over_time(results[name]).rename({results[name].dims[-1]: "observable"})
-    record = data_of(idata, name, rows)
+    rows = rows_of(idata, results, name, name, labels)
+    record: xr.DataArray | None
+    if bins is not None:
+        given = {"truth": truth is not None, "n_past": n_past is not None, "errors": errors}
+        if others := [argument for argument, is_given in given.items() if is_given]:
+            raise ModelError(f"bins must be None beside {' and '.join(others)}, got {bins!r}")
+        draws, record = pooled(idata, group, name, rows, records, model)
+    elif corrected:
+        raise ModelError("corrected must be False without bins, got True")
+    else:
+        rows = rows.choose("records", records)
+        draws = rows.over_time(results[name]).rename({results[name].dims[-1]: "observable"})
+        record = data_of(idata, name, rows)
     observables = names_of(draws, "observable")
     functions = functions_of(transform, observables)
     texts = [axis_label(one, functions, draws, record) for one in observables]
@@ -142,6 +182,10 @@ def plot_forecast(
         truth = transformed(truth, "observable", functions)
     draws = transformed(draws, "observable", functions)
     record = None if record is None else transformed(record, "observable", functions)
+    if record is not None and bins is not None:
+        labels = [f"corrected {text}" for text in texts] if corrected else texts
+        of_picture = {"labels": labels, "x": time, "backend": backend, "pc_kwargs": pc_kwargs}
+        return picture_in_bins(draws, record, bins, corrected, **of_picture)
 
     data = draws.to_dataset(name="observations")
     quantiles = over_draws(data)
