@@ -29,6 +29,10 @@ def errors_of(idata, **settings):
     return plot_forecast(idata, group="free_run", errors=True, **settings)
 
 
+def in_bins(idata, **settings):
+    return plot_forecast(idata, group="posterior_predictive", bins=4, **settings)
+
+
 PLOTS = [
     (plot_drift, "drift_scan"),
     (plot_evidence, "table"),
@@ -45,8 +49,16 @@ PLOTS = [
     (plot_states, "simulated"),
     (run_free, "free_run"),
     (errors_of, "free_run"),
+    (in_bins, "replicated"),
     (plot_terms, "terms"),
 ]
+
+
+@pytest.fixture(scope="session")
+def replicated(free_run):
+    """The draws of a free run as replicates of its record."""
+    groups = {"posterior_predictive": free_run["free_run"].to_dataset()[["d"]]}
+    return xr.DataTree.from_dict(groups | {"observed_data": free_run["observed_data"].to_dataset()})
 
 
 @pytest.fixture(scope="session")
