@@ -53,6 +53,9 @@ GIVEN = np.array([0.7]), RECORD_STEPS, RECORD, FORCE[:, np.newaxis], 0.0, 3
 @pytest.fixture(scope="module")
 def page():
     """What the page "A new filter" defines, in a user's file."""
+    assert "compiler" not in "".join(
+        re.findall("^(?:from|import) .*", PAGE.read_text(), re.MULTILINE)
+    )
     cells = re.findall(r"```\{code-cell\} python3\n(.*?)```", PAGE.read_text(), re.DOTALL)
     definitions = [cell.partition("\n\n\nfor ")[0] for cell in cells if "@dataclass" in cell]
     namespace = {"__name__": "a_users_file"}
