@@ -46,6 +46,12 @@ def check_system_and_filter(system: Any, filter: Any) -> System:
     check_system(system)
     check_filter(filter)
     compiled = compile_system(system)
+    if system.is_censored and not compiled.has_independent_sensors:
+        raise ModelError(
+            "censored needs observables that are independent given the state, got an "
+            "observation_noise that is not diagonal: leave out censored, or give the observables "
+            "independent noise"
+        )
     try:
         filter.check(compiled)
     except ModelError as refusal:

@@ -84,8 +84,13 @@ class IPLF(GaussianFilterBase):
         self._check_not_carried(system)
         self._check_no_jumping_parameters(system)
         check_sensor_has_noise(type(self).__name__, system)
-        if system.gaussian_observation:
+        if system.has_gaussian_sensor:
             return
+        if system.model.is_censored:
+            raise ModelError(
+                "IPLF takes censored values of an observation function with Gaussian noise, got "
+                "censored values of observation_dist"
+            )
         if system.model.equations.observation_draw is None:
             raise ModelError(
                 "IPLF needs the mean and variance of an observation, which observation_logp does "
@@ -127,7 +132,7 @@ class PosteriorLinearization(SigmaPoints):
 
     def observation(self, system: StateSpaceModel, values: Symbols, state: GaussianState) -> Seen:
         """The observation ``values["d"]``, linearised over its posterior."""
-        datum, n = values["d"], system.n
+        n = system.n
         moments = at_points(conditional_moments, system, values)
         nothing = pt.zeros((system.p, n))
         posterior = _Posterior(pt.zeros((n,)), nothing, nothing, nothing, pt.zeros(()))
@@ -135,8 +140,9 @@ class PosteriorLinearization(SigmaPoints):
             centre, root = posterior.of_state(state)
             line = self.regress(moments, centre, root)
             jac = posterior.by_prior(line.jac)
-            observation = seen(datum, line._replace(mean=line.mean - jac @ posterior.mean, jac=jac))
-            if not system.gaussian_observation:
+            line = line._replace(mean=line.mean - jac @ posterior.mean, jac=jac)
+            observation = seen(system, values, state, line)
+            if system.equations.observation_draw is not None:
                 observation = _without_certain(observation)
             posterior = _posterior(observation)
         term = self._log_density(system, values, state, posterior)

@@ -86,4 +86,4 @@ class Unscented(SigmaPoints):
     def observation(self, system: StateSpaceModel, values: Symbols, state: GaussianState) -> Seen:
         """The observation ``values["d"]``, over the forecast."""
         moments = at_points(observation_moments, system, values)
-        return seen(values["d"], self.regress(moments, state.mean, state.root))
+        return seen(system, values, state, self.regress(moments, state.mean, state.root))

@@ -8,6 +8,8 @@ are, in this order,
 * for each number of steps for which some drifting parameters are held, a one where they move at the
   end of the step, and a zero elsewhere;
 * of a system with events, a one where the step begins with an event, and the numbers of the event;
+* of a system with censored data, for each observable the side on which a true value lies beside
+  the one recorded at the beginning of the step: -1 below, 1 above, and 0 where it was measured;
 * for each accumulator a one where the step begins at an observation at which it is set to zero, and
   a zero elsewhere.
 
@@ -40,7 +42,8 @@ class InputRow(NamedTuple):
     """A row of inputs as a symbol: whole, the user's part, and the length and time of the step.
 
     The latter are None for a system on a grid. ``moves`` has an element for each number of steps
-    for which parameters are held, and ``columns`` are the numbers of the step from `TimeAxis`.
+    for which parameters are held, and ``columns`` are the numbers of the step from `TimeAxis`, of
+    which ``flags``, the last, are those of censored data, if there are any.
     """
 
     whole: TensorVariable
@@ -49,6 +52,7 @@ class InputRow(NamedTuple):
     time: TensorVariable | None
     moves: Mapping[int, TensorVariable]
     columns: TensorVariable
+    flags: TensorVariable | None
 
 
 def input_row(
@@ -58,18 +62,21 @@ def input_row(
     n_accumulators: int,
     held_for: Sequence[int],
     n_of_step: int,
+    n_censored: int,
 ) -> InputRow:
     """The symbol of a row; ``n_of_step`` are the columns of a `TimeAxis`."""
     first_move = n_inputs + 2 * at_any_times
     first_column = first_move + len(held_for)
-    n_columns = first_column + n_of_step + n_accumulators
+    end = first_column + n_of_step
+    n_columns = end + n_accumulators
     u = pt.tensor("u", shape=(n_columns,), dtype="float64")
     of_user = u[:n_inputs] if n_columns > n_inputs else u
     moves = {every: u[first_move + i] for i, every in enumerate(held_for)}
-    columns = u[first_column : first_column + n_of_step]
+    columns = u[first_column:end]
+    flags = u[end - n_censored : end] if n_censored else None
     if not at_any_times:
-        return InputRow(u, of_user, None, None, moves, columns)
-    return InputRow(u, of_user, u[n_inputs], u[n_inputs + 1], moves, columns)
+        return InputRow(u, of_user, None, None, moves, columns, flags)
+    return InputRow(u, of_user, u[n_inputs], u[n_inputs + 1], moves, columns, flags)
 
 
 def reset(

@@ -180,6 +180,7 @@ class StateSpaceModel:
         resets: str | None,
         drifting: Sequence[DriftingParameter] = (),
         at_any_times: bool = False,
+        n_censored: int = 0,
     ) -> None:
         """Set all fields, from what the user wrote."""
         functions = read(**written)
@@ -192,6 +193,7 @@ class StateSpaceModel:
             n_accumulators=len(accumulators),
             at_any_times=at_any_times,
             events=written["events"],
+            n_censored=n_censored,
         )
         state_names = checked_names("states", states, default_names("x", symbols.n_written))
         state_names += tuple(one.name for one in drifting)
@@ -222,10 +224,9 @@ class StateSpaceModel:
             drifting=tuple(drifting),
             additive_noise=seen.additive,
             discrete_noise=symbols.drawn is not None and symbols.drawn.is_discrete,
-            gaussian_observation=seen.gaussian,
-            observation_uses_inputs=any(
-                from_inputs.intersection(e.symbols) for e in functions.observation.equations
-            ),
+            gaussian_observation=seen.gaussian and not n_censored,
+            observation_uses_inputs=n_censored > 0
+            or any(from_inputs.intersection(e.symbols) for e in functions.observation.equations),
             observation_has_u=any("u" in e.symbols for e in functions.observation.equations),
             keeps_noises=False,
             equations=equations,
@@ -411,6 +412,34 @@ class StateSpaceModel:
         system._set(keeps_noises=self.keeps_noises)
         return system
 
+    @cached_property
+    def censored(self) -> "StateSpaceModel":
+        """The same system with flags of censored values as columns of inputs.
+
+        See `input_columns`.
+        """
+        if self.is_censored:
+            return self
+        if self.equations.observation_draw is None and self.equations.observation_logp is not None:
+            raise ModelError(
+                "censored needs the probability that an observation lies below a value, which "
+                "observation_logp does not give: use observation or observation_dist, or write the "
+                "probability in observation_logp and read flags from inputs"
+            )
+        if "_written" not in self.__dict__:
+            raise ModelError(
+                "system must not have been unpickled where values are censored, for "
+                "its functions are needed"
+            )
+        system = self._traced_again(self.is_at_any_times, n_censored=self.p)
+        system._set(keeps_noises=self.keeps_noises)
+        return system
+
+    @property
+    def is_censored(self) -> bool:
+        """Whether flags of censored values are columns of inputs."""
+        return self.equations.censoring is not None
+
     @property
     def why_one_length(self) -> str | None:
         """Why the steps of this system have one length; None if they may have any."""
@@ -449,6 +478,7 @@ class StateSpaceModel:
         self,
         at_any_times: bool,
         drifting: tuple[DriftingParameter, ...] | None = None,
+        n_censored: int | None = None,
         **changes: Any,
     ) -> "StateSpaceModel":
         system = object.__new__(StateSpaceModel)
@@ -456,7 +486,10 @@ class StateSpaceModel:
         settings = own["_settings"]
         if drifting is not None:
             settings = settings | {"drifting": drifting}
-        system._trace(own["_written"] | changes, **settings, at_any_times=at_any_times)
+        n_censored = self.is_censored * self.p if n_censored is None else n_censored
+        system._trace(
+            own["_written"] | changes, **settings, at_any_times=at_any_times, n_censored=n_censored
+        )
         system._set(known=self.known, has_instant_steps=self.has_instant_steps)
         return system
 
@@ -473,8 +506,8 @@ class StateSpaceModel:
 
     @property
     def n_step_columns(self) -> int:
-        """Number of the columns of a `TimeAxis`: the flag of an event, and its numbers."""
-        return 0 if self.events is None else 1 + len(self.events)
+        """Number of the columns of a `TimeAxis`: those of an event, and flags of censored data."""
+        return (0 if self.events is None else 1 + len(self.events)) + self.is_censored * self.p
 
     @property
     def names_resets(self) -> bool:

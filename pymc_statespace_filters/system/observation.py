@@ -8,10 +8,12 @@ import numpy as np
 import pytensor.scalar as ps
 import pytensor.tensor as pt
 from pytensor.compile.sharedvalue import SharedVariable
-from pytensor.graph.basic import Variable
+from pytensor.graph.basic import Constant, Variable
 from pytensor.graph.fg import FrozenFunctionGraph
 from pytensor.graph.replace import graph_replace
 from pytensor.graph.traversal import graph_inputs, io_toposort
+from pytensor.raise_op import CheckAndRaise
+from pytensor.scalar.math import BetaInc, GammaInc, GammaIncC, Log1mexp
 from pytensor.tensor.elemwise import Elemwise
 from pytensor.tensor.random.type import RandomType
 from pytensor.tensor.variable import TensorVariable
@@ -98,8 +100,10 @@ class GaussianObservation:
         functions = (self.observation, self.covariance)
         return tuple(f for f in functions if isinstance(f, Equation))
 
-    def trace(self, values: Values, n_observables: int | None) -> TracedObservation:
-        """Call the functions with symbols."""
+    def trace(
+        self, values: Values, n_observables: int | None, flags: TensorVariable | None = None
+    ) -> TracedObservation:
+        """Call the functions with symbols; filters see to the ``flags`` beside Gaussian noise."""
         additive = "e" not in self.observation.symbols
         p = r = None
         if additive:
@@ -152,10 +156,12 @@ class DensityObservation:
         density = tuple(f for f in (self.dist, self.logp) if f is not None)
         return density if self.simulated is None else density + self.simulated.equations
 
-    def trace(self, values: Values, n_observables: int | None) -> TracedObservation:
-        """Call the functions with symbols."""
+    def trace(
+        self, values: Values, n_observables: int | None, flags: TensorVariable | None = None
+    ) -> TracedObservation:
+        """Call the functions with symbols; for ``flags`` see `input_columns`."""
         if self.dist is not None:
-            return _trace_distributions(self.dist, values, n_observables)
+            return _trace_distributions(self.dist, values, n_observables, flags)
         assert self.logp is not None
         if self.simulated is not None:
             seen = self.simulated.trace(values, n_observables)
@@ -186,7 +192,7 @@ def _of_state(equation: Equation) -> Equation:
 
 
 def _trace_distributions(
-    dist: Equation, values: Values, n_observables: int | None
+    dist: Equation, values: Values, n_observables: int | None, flags: TensorVariable | None
 ) -> TracedObservation:
     returned = dist(values)
     variables = list(returned) if isinstance(returned, list | tuple) else [returned]
@@ -196,7 +202,10 @@ def _trace_distributions(
             f"{len(variables)}"
         )
     datum = pt.tensor("d", shape=(len(variables),), dtype="float64")
-    terms = [_log_density(variable, datum[i]) for i, variable in enumerate(variables)]
+    terms = [
+        _log_density(variable, datum[i], None if flags is None else flags[i])
+        for i, variable in enumerate(variables)
+    ]
     return TracedObservation(
         noise=pt.tensor("e", shape=(0,), dtype="float64"),
         datum=datum,
@@ -216,8 +225,13 @@ def _with_slope_at_zero(logp: TensorVariable) -> TensorVariable:
     return graph_replace([logp], logs, strict=False)[0] if logs else logp
 
 
-def _log_density(variable: Any, value: TensorVariable) -> TensorVariable:
-    """The log-density of one component, 0 where it is missing: it is independent of the others."""
+def _log_density(
+    variable: Any, value: TensorVariable, flag: TensorVariable | None
+) -> TensorVariable:
+    """The log-density of one component, 0 where it is missing: it is independent of the others.
+
+    Of a censored one, the log of the probability of the side on which the ``flag`` says it lies.
+    """
     if not isinstance(variable, TensorVariable) or variable.type.ndim != 0:
         raise ModelError(
             "observation_dist must return one scalar PyMC distribution per observable "
@@ -243,4 +257,68 @@ def _log_density(variable: Any, value: TensorVariable) -> TensorVariable:
             f"observation_dist must return distributions with a log-density, got {variable}: "
             f"{error}"
         ) from error
+    if flag is not None:
+        below, above = _sides(variable, value, flag)
+        there = pt.switch(pt.eq(flag, 0.0), there, pt.switch(pt.lt(flag, 0.0), below, above))
     return pt.switch(missing, 0.0, there)
+
+
+def _sides(
+    variable: TensorVariable, value: TensorVariable, flag: TensorVariable
+) -> tuple[TensorVariable, TensorVariable]:
+    """Logs of the probabilities of at most, and of at least, a value."""
+    from pymc import logcdf
+
+    values = (value, value)
+    if is_count := "int" in variable.type.dtype:
+        values = (pt.floor(value), pt.ceil(value) - 1.0)
+    try:
+        at_most, less = (
+            logcdf(variable, pt.cast(one, variable.type.dtype) if is_count else one)
+            for one in values
+        )
+    except NotImplementedError as error:
+        raise ModelError(
+            f"censored needs the distribution function of every observable, got {variable}, of "
+            f"which PyMC has none: {error}; use another distribution"
+        ) from error
+    below, above = pt.lt(flag, 0.0), pt.gt(flag, 0.0)
+    return _rewritten(at_most, below, contrary=False), _rewritten(less, above, contrary=True)
+
+
+# Of functions that are probabilities, the probability of the contrary.
+_CONTRARY = {
+    GammaInc: pt.gammaincc,
+    GammaIncC: pt.gammainc,
+    BetaInc: lambda a, b, x: pt.betainc(b, a, 1.0 - x),
+}
+
+
+def _rewritten(log_p: TensorVariable, used: TensorVariable, *, contrary: bool) -> TensorVariable:
+    """A log-probability that has a derivative where it is not ``used``, or that of the contrary.
+
+    1 - p is written as p is, so that it keeps its digits where p is near one.
+    """
+    node = log_p.owner
+    if isinstance(log_p, Constant):
+        p = np.exp(log_p.data)
+        return pt.constant(np.log1p(-p) if p < 1.0 else -np.inf) if contrary else log_p
+    if node is not None and isinstance(node.op, CheckAndRaise):
+        return node.op(_rewritten(node.inputs[0], used, contrary=contrary), *node.inputs[1:])
+    kind = type(node.op.scalar_op) if node is not None and isinstance(node.op, Elemwise) else None
+    if kind is ps.Switch:
+        branches = (_rewritten(branch, used, contrary=contrary) for branch in node.inputs[1:])
+        return pt.switch(node.inputs[0], *branches)
+    if kind is ps.Log:
+        (p,) = node.inputs
+        known = getattr(getattr(p.owner, "op", None), "scalar_op", None)
+        if contrary and type(known) in _CONTRARY:
+            p, contrary = _CONTRARY[type(known)](*p.owner.inputs), False
+        p = pt.switch(used, p, 0.5)
+        return pt.log1p(-p) if contrary else pt.log(p)
+    if kind is ps.Log1p and contrary:
+        return pt.log(pt.switch(used, -node.inputs[0], 0.5))
+    if kind is Log1mexp:
+        log_q = pt.switch(used, node.inputs[0], -1.0)
+        return log_q if contrary else pt.log1mexp(log_q)
+    return pt.log1mexp(pt.switch(used, log_p, -1.0)) if contrary else log_p

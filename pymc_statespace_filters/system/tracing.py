@@ -144,8 +144,9 @@ class Equations:
 
     ``finite_step`` has a further input ``v``, the values of the variables of ``process_dist`` that
     take finitely many: the next state given them, then their law, see `GivenValues`.
-    ``finite_start``, of theta, normals and values, is the same of the start. Both follow from what
-    the user wrote, as the others do, and are not compared.
+    ``finite_start``, of theta, normals and values, is the same of the start. ``censoring`` are the
+    flags (p,) of a system with censored data. These follow from what the user wrote, as the others
+    do, and are not compared.
     """
 
     transition: FrozenFunctionGraph
@@ -161,6 +162,7 @@ class Equations:
     finite_step: FrozenFunctionGraph | None = field(default=None, compare=False)
     finite_start: FrozenFunctionGraph | None = field(default=None, compare=False)
     others_are_gaussian: bool = field(default=True, compare=False)
+    censoring: FrozenFunctionGraph | None = field(default=None, compare=False)
 
 
 def read(
@@ -204,6 +206,7 @@ def size(
     n_accumulators: int = 0,
     at_any_times: bool = False,
     events: Sequence[str] = (),
+    n_censored: int = 0,
 ) -> Symbols:
     """Make the symbols, parameters first: the lengths of the others depend on them."""
     n_theta = sum(map(size_of, signature.shapes))
@@ -215,7 +218,8 @@ def size(
         at_any_times=at_any_times,
         n_accumulators=n_accumulators,
         held_for=held_for(drifting),
-        n_of_step=0 if functions.event is None else 1 + len(events),
+        n_of_step=(0 if functions.event is None else 1 + len(events)) + n_censored,
+        n_censored=n_censored,
     )
     time = pt.tensor("t", shape=(), dtype="float64")
     state, x = _longer("x", start.mean.type.shape[0], len(drifting))
@@ -255,7 +259,8 @@ def trace(
     values, theta, u = symbols.values, symbols.theta, symbols.input_row.whole
     functions = _of_length(functions, symbols)
     n_observables = None if observables is None else len(observables)
-    seen = functions.observation.trace(values, n_observables)
+    flags = symbols.input_row.flags
+    seen = functions.observation.trace(values, n_observables, flags)
     process_noise = _trace_process_noise(functions, symbols)
     for role, cov in (("observation_noise", seen.covariance), ("process_noise", process_noise)):
         _check_free_of_state(role, cov, symbols)
@@ -284,6 +289,7 @@ def trace(
         initial_draw=start.freeze_draw(theta),
         finite_start=start.freeze_given_values(theta),
         others_are_gaussian=start.given is None or start.given.others_are_gaussian,
+        censoring=frozen("censored", flags),
     )
     return _with_finite_step(equations, functions, symbols, inputs, begin), seen
 

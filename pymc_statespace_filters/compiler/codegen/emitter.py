@@ -23,16 +23,26 @@ from ..numerics import exponential, trigonometric
 from ..numerics.quantiles.binomial import bernoulli_quantile, binomial_quantile
 from ..numerics.quantiles.gamma import gamma_quantile
 from ..numerics.quantiles.normal import normal_probability
+from ..numerics.quantiles.normal_below import (
+    normal_excess,
+    normal_hazard,
+    normal_log_probability,
+    normal_variance_below,
+)
 from ..numerics.quantiles.poisson import poisson_quantile
 from . import trigamma as trigamma  # of which PyTensor's numba has no machine code
 from .expressions import BOOLEAN, FLOAT, INTEGER, Expression, Value, in_order, kind_of
 from .function_types import jit
 from .machine_code import BOOL, DOUBLE, INT, Module
 
+_NORMAL = (
+    normal_probability, normal_log_probability, normal_hazard, normal_excess, normal_variance_below,
+)  # fmt: skip
+
 QUANTILES = {
     function.py_func.__name__: function
     for function in (
-        poisson_quantile, binomial_quantile, bernoulli_quantile, gamma_quantile, normal_probability,
+        poisson_quantile, binomial_quantile, bernoulli_quantile, gamma_quantile, *_NORMAL,
     )
 }  # fmt: skip
 """By the names that operations have as ``machine_code``."""
@@ -44,7 +54,7 @@ INLINED = {
         exponential.log10, exponential.log1p, exponential.power, exponential.sinh, exponential.cosh,
         exponential.tanh, trigonometric.sin, trigonometric.cos, trigonometric.tan,
         trigonometric.arctan, trigonometric.arctan2, trigonometric.floor_divide,
-        trigonometric.modulo, normal_probability,
+        trigonometric.modulo, *_NORMAL,
     )
 }  # fmt: skip
 """What loops over members call."""

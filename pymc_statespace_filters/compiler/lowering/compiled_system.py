@@ -311,6 +311,19 @@ class CompiledSystem:
         """Parameters of which every likelihood is known to be a staircase."""
         return stepped_parameters(self.asked)
 
+    @property
+    def has_gaussian_sensor(self) -> bool:
+        """Whether an observation is a function with Gaussian noise, of which parts may be censored.
+
+        If none is, its density is Gaussian, which is ``gaussian_observation``.
+        """
+        return self.model.equations.observation_logp is None
+
+    @cached_property
+    def has_independent_sensors(self) -> bool:
+        """Whether the observables are independent given the state; False if unknown."""
+        return structure.has_independent_sensors(self.asked)
+
     @cached_property
     def has_smooth_sensor(self) -> bool:
         """Whether no observable has a kink as a function of the state."""

@@ -13,6 +13,8 @@ from ...system.model import StateSpaceModel
 from .finite_states import FiniteStates, start_symbols, step_symbols
 from .symbols import SYMBOLS, call, symbols_of
 
+_KEPT = ("process_noise", "observation", "observation_noise", "observation_logp", "censoring")
+
 
 def given_regime(model: StateSpaceModel, found: FiniteStates) -> StateSpaceModel:
     """The system of the continuous states, given the finite ones and the finite variables.
@@ -40,7 +42,7 @@ def given_regime(model: StateSpaceModel, found: FiniteStates) -> StateSpaceModel
     equations = model.equations
     replaced: dict[str, FrozenFunctionGraph | None] = {
         name: graph(call(old, model, given))
-        for name in ("process_noise", "observation", "observation_noise", "observation_logp")
+        for name in _KEPT
         if (old := getattr(equations, name)) is not None
     }
     if equations.observation_draw is not None:

@@ -15,6 +15,7 @@ from pytensor.tensor.variable import TensorVariable
 from ...errors import ModelError
 from ...system import distributions
 from ...system.model import StateSpaceModel
+from ...system.normal_below import log_probability
 from ..codegen.array_fallback import array_code
 from ..codegen.function_types import CompiledFunction, jit
 from ..native.cache_key import key_of
@@ -65,9 +66,23 @@ def observation_log_density(
     if system.equations.observation_logp is not None:
         return call(system.equations.observation_logp, system, symbols)
     mean, cov = observation_moments(system, symbols)
+    if system.equations.censoring is not None:
+        flags = call(system.equations.censoring, system, symbols)
+        residual, cov, seen = without_missing(symbols["d"], mean, cov)
+        return _log_of_independent(residual, pt.diagonal(cov), seen, flags)
     if is_complete:
         return log_normal(symbols["d"] - mean, cov, pt.ones(system.p))
     return log_normal(*without_missing(symbols["d"], mean, cov))
+
+
+def _log_of_independent(
+    residual: TensorVariable, variances: TensorVariable, seen: TensorVariable, flags: TensorVariable
+) -> TensorVariable:
+    """Sum of log N(residual; 0, variance), or of the log of the probability of a side."""
+    sd = pt.sqrt(variances)
+    measured = -0.5 * (residual**2 / variances + LOG_TWO_PI) - pt.log(sd)
+    cut = log_probability(-flags * residual / sd)
+    return pt.sum(seen * pt.switch(pt.eq(flags, 0.0), measured, cut))
 
 
 def expected_observation(
@@ -97,7 +112,7 @@ def conditional_moments(
     system: StateSpaceModel, symbols: Mapping[str, TensorVariable]
 ) -> tuple[TensorVariable, TensorVariable]:
     """E[d | x] and Cov[d | x]; noise inside a function is linearised at zero (Eq. 4.4)."""
-    if system.gaussian_observation:
+    if system.equations.observation_draw is None:
         return observation_moments(system, symbols)
     means, variances = zip(*map(_moments_of, _distributions(system, symbols)), strict=True)
     return pt.stack(means), pt.diag(pt.stack(variances))

@@ -1,9 +1,10 @@
-"""Quantile operations in graphs that PyTensor compiles itself, to numba."""
+"""Operations with machine code of the package in graphs that PyTensor compiles itself, to numba."""
 
 from typing import Any
 
 from pytensor.link.numba.dispatch.basic import register_funcify_and_cache_key
 
+from ...system.normal_below import NormalBelow
 from ...system.quantiles import NoDerivative, Quantile
 from ..codegen.emitter import QUANTILES
 from ..native.cache_key import key_of
@@ -13,10 +14,11 @@ from ..native.jit import njit_callable
 def register() -> None:
     """Tell PyTensor's numba backend what the operations are in machine code."""
     register_funcify_and_cache_key(Quantile)(_machine_code)
+    register_funcify_and_cache_key(NormalBelow)(_machine_code)
     register_funcify_and_cache_key(NoDerivative)(_refuse)
 
 
-def _machine_code(op: Quantile, node: Any = None, **_: Any) -> tuple:
+def _machine_code(op: Quantile | NormalBelow, node: Any = None, **_: Any) -> tuple:
     function = QUANTILES[op.machine_code]
 
     @njit_callable

@@ -135,6 +135,7 @@ def is_linear(system: StateSpaceModel) -> bool:
     """Whether state and noise, which is Gaussian, enter transition and observation linearly."""
     return (
         system.gaussian is system
+        and not system.is_censored
         and has_linear_observation(system)
         and has_linear_transition(system)
     )
@@ -236,7 +237,7 @@ def step_moments(system: StateSpaceModel, symbols: Mapping[str, TensorVariable])
 
 def has_exact_sensor(system: StateSpaceModel) -> bool:
     """Whether a sensor is known to have no noise: its density given the state does not exist."""
-    if not system.gaussian_observation:
+    if system.equations.observation_logp is not None:
         return False
     symbols = symbols_of(system)
     _, cov = observation_moments(system, symbols)
@@ -244,6 +245,15 @@ def has_exact_sensor(system: StateSpaceModel) -> bool:
         return any(zeros(pt.diagonal(cov), symbols))
     eigenvalues = np.linalg.eigvalsh(cov.data)
     return bool(eigenvalues.min() <= 1e-12 * eigenvalues.max())
+
+
+def has_independent_sensors(system: StateSpaceModel) -> bool:
+    """Whether the observables are independent given the state; False where undecided."""
+    if system.equations.observation_logp is not None:
+        return system.equations.observation_draw is not None
+    symbols, others = symbols_of(system), np.nonzero(~np.eye(system.p, dtype=bool))
+    _, cov = observation_moments(system, symbols)
+    return system.p == 1 or all(zeros(cov[others], symbols))
 
 
 def start_over_noise(system: StateSpaceModel) -> float:

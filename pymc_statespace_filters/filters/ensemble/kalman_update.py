@@ -157,6 +157,10 @@ def kalman_update(d, D, alive, free, moments, X):
 
 def check_simulated_observations(name: str, system: System) -> None:
     """Raise unless an observation can be simulated for a Kalman gain."""
+    if system.model.is_censored:
+        raise ModelError(
+            f"{name} updates members by a Kalman gain and so needs measured values, got censored"
+        )
     if not system.gaussian_observation:
         raise ModelError(
             f"{name} updates members by a Kalman gain and so needs an observation function with "

@@ -114,7 +114,7 @@ class GaussianFilterBase(TapedFilter):
         """Raise if the observation of an uncertain state is not Gaussian, that of another exact."""
         if system.is_deterministic:
             check_sensor_has_noise(type(self).__name__, system)
-        if not (system.gaussian_observation or system.is_deterministic):
+        if not (system.has_gaussian_sensor or system.is_deterministic):
             raise ModelError(
                 f"{type(self).__name__} needs an observation function with Gaussian noise, got "
                 f"observation_dist or observation_logp"

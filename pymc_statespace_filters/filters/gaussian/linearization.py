@@ -20,6 +20,7 @@ from ...compiler.lowering.observation import log_normal, without_missing
 from ...compiler.lowering.structure import has_linear_observation, has_linear_transition
 from ...compiler.lowering.symbols import call, jacobian_of, observation_moments, process_noise_cov
 from ...system.model import StateSpaceModel
+from .censoring import truncate
 
 Symbols = Mapping[str, TensorVariable]
 
@@ -77,8 +78,9 @@ class Linear(NamedTuple):
 class Seen(NamedTuple):
     """A linearised observation: residual = jac xi + e, e ~ N(0, noise_cov).
 
-    Missing components have zero residuals and rows of ``jac``, and independent unit noise. ``term``
-    is log p(d_j | d_1 .. d_{j-1}), None where it is the density of the residual.
+    Missing components have zero residuals and rows of ``jac``, and independent unit noise; for
+    censored ones see `censoring`. ``term`` is log p(d_j | d_1 .. d_{j-1}), None where it is the
+    density of the residual.
     """
 
     residual: TensorVariable
@@ -128,10 +130,16 @@ class Innovation(NamedTuple):
     update: TensorVariable
 
 
-def seen(datum: TensorVariable, linear: Linear) -> Seen:
+def seen(system: StateSpaceModel, values: Symbols, state: GaussianState, linear: Linear) -> Seen:
     """Compare a linearised observation with the datum, NaN where missing."""
-    residual, noise_cov, observed = without_missing(datum, linear.mean, linear.noise_cov)
-    return Seen(residual, observed, linear.jac * observed[:, None], noise_cov)
+    residual, noise_cov, observed = without_missing(values["d"], linear.mean, linear.noise_cov)
+    jac = linear.jac * observed[:, None]
+    if system.equations.censoring is None:
+        return Seen(residual, observed, jac, noise_cov)
+    flags = call(system.equations.censoring, system, values)
+    cov = product(jac, state.cov, jac.T) + noise_cov
+    residual, more_noise, term = truncate(residual, cov, observed, flags)
+    return Seen(residual, observed, jac, noise_cov + pt.diag(more_noise), term)
 
 
 def innovation_of(state: GaussianState, observation: Seen) -> Innovation:
@@ -213,7 +221,8 @@ class Tangent:
     def observation(self, system: StateSpaceModel, values: Symbols, state: GaussianState) -> Seen:
         """Eq. 4.4: C and D at the forecast."""
         expected, noise_cov = observation_moments(system, {**values, "x": state.mean})
-        return seen(values["d"], Linear(expected, jacobian_of(expected, state.mean), noise_cov))
+        linear = Linear(expected, jacobian_of(expected, state.mean), noise_cov)
+        return seen(system, values, state, linear)
 
 
 @lru_cache(maxsize=256)
