@@ -86,11 +86,13 @@ def filter_diagnostics(
           whose mean is the likelihood term of each observation; infinite for a deterministic
           filter, NaN where the observation is missing.
         * ``d_pit`` (d_time, observable): the probability of a prediction below the observation;
-          NaN where the observation is missing. It is computed from the filter's own law of the
+          NaN where the observation is missing, and drawn from its interval where it is censored. It
+          is computed from the filter's own law of the
           prediction if that is known (Gaussian filters, `GridFilter`), else from the observation
           noise around the drawn states; for other noise it is the fraction of predictions not above
           the observation, with ties broken at random so that counts are uniform too.
-        * ``d_residual`` (d_time, observable): the standard normal quantile of ``d_pit``.
+        * ``d_residual`` (d_time, observable): the standard normal quantile of ``d_pit``; NaN where
+          the observation is censored.
         * ``d_clipped`` (d_time, observable): whether the residual is cut off, as the draws cannot
           tell how far out the observation is: it is at least so far.
         * ``d_innovation`` (d_time, observable), ``d_innovation_cov`` (d_time, observable,
@@ -182,7 +184,7 @@ def filter_diagnostics(
             },
         )
         part[f"{name}_predicted"].attrs = {"filter": repr(variable.filter)}
-        observed = [one.record.scored for one in found]
+        observed = [one.record.measured for one in found]
         part = part.merge(_results_by_row(variable, [one.calibration for one in found], observed))
         part = part.merge(by_record(at_draws, [_results_by_record(one) for one in found]))
         parts.append(part)
@@ -222,9 +224,9 @@ def _of_record(record: RecordAtDraws, rng: np.random.Generator) -> _Found:
     )
     laws = laws_of(record, before)
     if laws is None:
-        calibration = calibration_by_rank(predicted, record.scored, rng)
+        calibration = calibration_by_rank(predicted, record.scored, rng, record.flags)
     else:
-        calibration = calibration_of(laws, record.scored)
+        calibration = calibration_of(laws, record.scored, rng, record.flags)
     return _Found(record, health, predicted, calibration)
 
 
@@ -263,7 +265,7 @@ def _results_by_record(found: _Found) -> xr.Dataset:
         record.variable.name, record.variable.dims, record.variable.system
     )  # fmt: skip
     pit, residual = calibration.pit, calibration.residual
-    innovation = record.scored - calibration.mean
+    innovation = record.measured - calibration.mean
     z, lags = standardised(innovation, calibration.cov), lags_of(len(innovation))
     smallest = np.fmin.reduce(found.health.n_effective, axis=1, initial=np.inf)
     results = xr.Dataset(

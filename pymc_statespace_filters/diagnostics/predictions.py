@@ -63,7 +63,7 @@ def laws_of(record: RecordAtDraws, before: States) -> Laws | None:
         return Laws(mean, cov, log_below, log_above, known=True)
     if (taped := tape_of(record.variable)) is not None:
         terms, mean, cov = _linearised(record, taped, before.seeds)
-        if _give_terms(mean, cov, record.scored, terms):
+        if _give_terms(mean, cov, record.measured, terms):
             return Laws(mean, cov, *_tails(mean, cov, record.scored), known=True)
     drawn = before.drawn.reshape(-1, system.n)
     mean, cov = _observations(record, Moments(drawn, None), slice(None))
@@ -118,8 +118,13 @@ def _observations(record: RecordAtDraws, states: Moments, draws: slice) -> tuple
     )
 
 
-def calibration_of(laws: Laws, observed: Array) -> Calibration:
-    """Compare the observations (J, p) with the mixture of their laws."""
+def calibration_of(
+    laws: Laws, observed: Array, rng: np.random.Generator, flags: Array | float = 0.0
+) -> Calibration:
+    """Compare the observations (J, p) with the mixture of their laws.
+
+    A censored one has no residual, and a transform anywhere on its side.
+    """
     draws = np.isfinite(laws.mean)
     n_draws = draws.sum(axis=0)
     unseen = np.isnan(observed) | (n_draws == 0)
@@ -133,17 +138,24 @@ def calibration_of(laws: Laws, observed: Array) -> Calibration:
     few = np.where(is_low, few_below, few_above) & (not laws.known)
     clipped = (few & (np.abs(residual) > limit)) | (np.minimum(below, above) < _LOWEST)
     residual = np.where(few, np.clip(residual, -limit, limit), residual)
-    pit = np.where(unseen, np.nan, np.clip(np.exp(below), _LEAST_PIT, 1.0 - _LEAST_PIT))
+    low, high = np.where(flags < 0, 0.0, np.exp(below)), np.where(flags > 0, 1.0, np.exp(below))
+    pit = low + rng.uniform(size=low.shape) * (high - low)
+    pit = np.where(unseen, np.nan, np.clip(pit, _LEAST_PIT, 1.0 - _LEAST_PIT))
     mean, cov = _mixed_moments(laws.mean, laws.cov)
-    return Calibration(pit, np.where(unseen, np.nan, residual), clipped & ~unseen, mean, cov)
+    unmeasured = unseen | (flags != 0)
+    residual = np.where(unmeasured, np.nan, residual)
+    return Calibration(pit, residual, clipped & ~unmeasured, mean, cov)
 
 
-def calibration_by_rank(predicted: Array, observed: Array, rng: np.random.Generator) -> Calibration:
+def calibration_by_rank(
+    predicted: Array, observed: Array, rng: np.random.Generator, flags: Array | float = 0.0
+) -> Calibration:
     """Compare the observations with draws of their predictions (draws, J, p)."""
-    pit = pit_of(observed, predicted, rng)
+    pit = pit_of(observed, predicted, rng, flags)
     limit = residual_limit(len(predicted))
     with np.errstate(divide="ignore"):
         residual = np.clip(ndtri_exp(np.log(pit)), -limit, limit)
+    residual = np.where(flags == 0, residual, np.nan)
     mean, cov = _mixed_moments(predicted, np.zeros((*predicted.shape, predicted.shape[-1])))
     return Calibration(pit, residual, np.abs(residual) >= limit, mean, cov)
 

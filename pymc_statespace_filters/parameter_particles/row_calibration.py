@@ -15,6 +15,7 @@ from ..evaluation.simulate import observer
 from ..smc.merging import merged_index
 from ..smc.particles import Populations
 from ..statistics.pit import pit_of
+from ..system.input_columns import flags_at
 from .observed_rows import ObservedRows
 
 N_PREDICTED = 1000  # draws of the prediction of a row, at most
@@ -49,4 +50,5 @@ def transform_of_row(
         observer(rows.variable.system).function, rng, theta[known], states[known], step,
         record.inputs, float(record.t0),
     )  # fmt: skip
-    return pit_of(observed, predicted, rng)
+    (flags,) = flags_at(rows.variable.system, record.inputs, record.steps[[row]])
+    return pit_of(observed, predicted, rng, flags)

@@ -274,7 +274,7 @@ def _inputs_of_records(
 def _measured(record: RecordAtDraws, observed: Any, steps: NDArray[np.int64]) -> Array:
     """The measurements (R, p) to compare with: those given, else those of the model."""
     if observed is None:
-        return record.scored
+        return record.measured
     return check_observed(observed, record.variable.system, steps.size)
 
 

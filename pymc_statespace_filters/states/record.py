@@ -18,6 +18,7 @@ from ..pymc_model.state_space_variable import (
 )
 from ..system.input_columns import (
     columns_of_steps,
+    flags_at,
     inputs_of_user,
     n_input_rows,
     with_columns,
@@ -81,6 +82,16 @@ class RecordAtDraws:
         scored = self.observed.copy()
         scored[: self.variable.score_from] = np.nan
         return scored
+
+    @property
+    def flags(self) -> Array:
+        """On which side of the data (J, p) true values lie: -1 below, 1 above, 0 where measured."""
+        return flags_at(self.variable.system, self.inputs[0], self.steps)
+
+    @property
+    def measured(self) -> Array:
+        """The data that are scored, NaN where they are censored."""
+        return np.where(self.flags == 0.0, self.scored, np.nan)
 
     @property
     def theta(self) -> Array:

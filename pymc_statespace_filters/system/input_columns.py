@@ -328,6 +328,14 @@ def without_events(system: "StateSpaceModel", rows: np.ndarray) -> np.ndarray:
     return rows
 
 
+def flags_at(system: "StateSpaceModel", rows: np.ndarray, steps: Any) -> np.ndarray:
+    """The flags (J, p) of the observations at these steps, of rows (rows, n_input_columns)."""
+    columns = columns_of_steps(system, rows)
+    if columns is None or not system.is_censored:
+        return np.zeros((len(steps), system.p))
+    return columns[steps, -system.p :]
+
+
 def times_of_steps(system: "StateSpaceModel", inputs: Any, steps: Any, t0: Any) -> Any:
     """The times at which steps begin, from the inputs (rows, n_input_columns) of a record."""
     if system.is_at_any_times:

@@ -17,6 +17,8 @@ from pymc_statespace_filters.diagnostics.predictions import (
 )
 from pymc_statespace_filters.statistics.pit import pit_of
 
+RNG = np.random.default_rng(0)
+
 
 def test_the_place_of_a_datum_among_draws():
     draws = np.arange(9.0)[:, None]
@@ -42,6 +44,32 @@ def test_a_missing_datum_has_none_and_failed_draws_do_not_count():
     assert np.isnan(pit[2])
 
 
+def test_a_censored_count_of_the_law_of_the_draws_is_uniform_and_has_no_residual():
+    """Values are recorded as 2 where they are at most 2, and as 4 where at least 4."""
+    rng = np.random.default_rng(4)
+    numbers = rng.poisson(3.0, (20, 4000, 1)).astype(float)
+    true = numbers[0]
+    flags = np.where(true <= 2, -1, np.where(true >= 4, 1, 0))
+    found = calibration_by_rank(numbers[1:], np.clip(true, 2, 4), rng, flags)
+    assert kstest(found.pit[:, 0], "uniform").pvalue > 1e-3
+    np.testing.assert_array_equal(np.isnan(found.residual), flags != 0)
+    assert not found.clipped[flags != 0].any()
+
+
+def test_the_transform_of_a_censored_value_is_drawn_from_its_interval():
+    mean, cov = np.zeros((1, 3000, 1)), np.ones((1, 3000, 1, 1))
+    limits = np.full((3000, 1), 0.4)
+    flags = np.resize([-1, 1, 0], (3000, 1))
+    z = limits - mean
+    laws = Laws(mean, cov, norm.logcdf(z), norm.logsf(z), True)
+    found = calibration_of(laws, limits, RNG, flags)
+    at = norm.cdf(0.4)
+    for flag, low, width in ((-1, 0.0, at), (1, at, 1.0 - at)):
+        assert kstest(found.pit[flags == flag], "uniform", (low, width)).pvalue > 1e-3
+    np.testing.assert_allclose(found.pit[flags == 0], at)
+    np.testing.assert_array_equal(np.isnan(found.residual), flags != 0)
+
+
 def test_residuals_by_rank_are_normal_quantiles_within_what_draws_can_tell():
     draws = np.arange(100.0)[:, None, None] * np.ones((4, 1))
     observed = np.array([[-1.0], [49.5], [np.nan], [200.0]])
@@ -62,7 +90,7 @@ def test_the_mixture_over_draws_has_its_own_tails_and_moments():
     mean = np.broadcast_to(means[:, None, None], (3, 3, 1))
     cov = np.full((3, 3, 1, 1), sd**2)
     z = (observed - mean) / sd
-    found = calibration_of(Laws(mean, cov, norm.logcdf(z), norm.logsf(z), True), observed)
+    found = calibration_of(Laws(mean, cov, norm.logcdf(z), norm.logsf(z), True), observed, RNG)
     pit = norm.cdf((observed[:2] - means[:2]) / sd).mean(axis=1)
     np.testing.assert_allclose(found.pit[:2, 0], pit)
     np.testing.assert_allclose(found.residual[:2, 0], norm.ppf(pit))
@@ -80,7 +108,7 @@ def test_a_tail_that_one_draw_decides_is_cut_off():
     laws = Laws(
         states, np.full((200, 3, 1, 1), noise**2), norm.logcdf(z), norm.logsf(z), known=False
     )
-    found = calibration_of(laws, observed)
+    found = calibration_of(laws, observed, RNG)
     np.testing.assert_array_equal(found.clipped[:, 0], [False, True, True])
     np.testing.assert_allclose(found.residual[1:, 0], residual_limit(200) * np.array([1, -1]))
     assert found.residual[0, 0] == pytest.approx(0.4, abs=0.01)
@@ -96,7 +124,7 @@ def test_a_tail_is_known_by_the_effective_number_of_its_draws():
         above = np.log(tails).reshape(shape)
         below = np.log1p(-tails).reshape(shape)
         laws = Laws(np.zeros(shape), np.ones((*shape, 1)), below, above, known=False)
-        found = calibration_of(laws, np.zeros((1, 1)))
+        found = calibration_of(laws, np.zeros((1, 1)), RNG)
         expected = residual_limit(5) if clipped else norm.isf(tails.mean())
         assert found.residual.item() == pytest.approx(expected, rel=1e-9)
         assert found.clipped.item() == clipped
