@@ -134,7 +134,7 @@ def test_moments_of_a_mixture_have_covariances():
     mean = np.array([[[1.0, -2.0]], [[-1.0, 2.0]], [[np.nan, 0.0]]])
     cov = np.broadcast_to([[0.5, 0.1], [0.1, 0.3]], (3, 1, 2, 2))
     tails = np.full((3, 1, 2), np.log(0.5))
-    found = calibration_of(Laws(mean, cov, tails, tails, True), np.zeros((1, 2)))
+    found = calibration_of(Laws(mean, cov, tails, tails, True), np.zeros((1, 2)), RNG)
     np.testing.assert_allclose(found.mean, [[0.0, 0.0]], atol=1e-15)
     np.testing.assert_allclose(found.cov, [[[1.5, -1.9], [-1.9, 4.3]]])
 
