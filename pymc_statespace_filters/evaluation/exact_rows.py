@@ -11,11 +11,15 @@ from ..filters.protocol import Filter
 from ..system.record import Record
 
 
-def check_rows(record: Record, filter: Filter) -> None:
-    """Raise if a filter cannot treat the steps of a record, or its rows have no density."""
-    if record.system.has_instant_steps:
+def check_rows(record: Record, filter: Filter, *, goes_on: bool = False) -> None:
+    """Raise if a filter cannot treat the steps and values of a record, or rows have no density.
+
+    The latter is not asked of rows that go on from others.
+    """
+    if record.system.has_instant_steps or record.system.is_censored:
         check_system_and_filter(record.system, filter)
-    check_exact_rows(record)
+    if not goes_on:
+        check_exact_rows(record)
 
 
 def check_exact_rows(record: Record) -> None:

@@ -41,6 +41,7 @@ def log_likelihood(
     input_times: Any = None,
     inputs_at: str = "hold",
     events: Any = None,
+    censored: Any = None,
     seed: Any = 0,
     comm: Any = None,
     cores: int = 1,
@@ -112,7 +113,7 @@ def log_likelihood(
     """
     check_choice(system, filter)
     given = GivenRecord(
-        observed, panel, steps, times, inputs, t0, unit, input_times, inputs_at, events
+        observed, panel, steps, times, inputs, t0, unit, input_times, inputs_at, events, censored
     )
     n_threads, seeds = check_count("cores", cores, 1), check_seed("seed", seed)
     record = read_record(system, given)

@@ -46,6 +46,7 @@ def run_filter(
     input_times: Any = None,
     inputs_at: str = "hold",
     events: Any = None,
+    censored: Any = None,
     seed: int = 0,
     at: str = "observations",
     state: xr.Dataset | None = None,
@@ -132,12 +133,14 @@ def run_filter(
     if noise.ndim:
         raise ModelError(f"run_filter takes one seed, got an array of {noise.shape}")
     given = GivenRecord(
-        observed, panel, steps, times, inputs, t0, unit, input_times, inputs_at, events
+        observed, panel, steps, times, inputs, t0, unit, input_times, inputs_at, events, censored
     )
     earlier = None
     if state is not None:
         system, earlier = _earlier(system, state)
     record = read_record(system, given, earlier)
+    # Censored or not, the rows of a run are of one system.
+    written = system.at_any_times if record.system.is_at_any_times else system
     system, axes, labels = record.system, record.axes, record.labels
     of_each = list(panel_parameters(system, params, record.records))
     seeds = seeds_of_records(noise, record.records.codes) if record.is_panel else [noise]
@@ -145,9 +148,8 @@ def run_filter(
         (theta, *alone, seed)
         for theta, alone, seed in zip(of_each, record.each(), seeds, strict=True)
     ]
-    common = attributes(system, filter, of_each, noise, record.t0)
-    if state is None:
-        check_rows(record, filter)
+    common = attributes(written, filter, of_each, noise, record.t0)
+    check_rows(record, filter, goes_on=state is not None)
     ends = [float(axis.times(axis.steps[-1])) for axis in axes]
     clock = record.clock.stored() | {"ends": ends}
     if system.accumulators:

@@ -165,6 +165,7 @@ class StateSpace(Continuous):
         input_times: Any = None,
         inputs_at: str = "hold",
         events: Any = None,
+        censored: Any = None,
         seed: int = 0,
         score_from: int = 0,
         dims: Sequence[str] | None = None,
@@ -187,8 +188,9 @@ class StateSpace(Continuous):
         full_name = model.name_for(name)
         _check_name(model, full_name, name, system)
         given = GivenRecord(
-            observed, panel, steps, times, inputs, t0, unit, input_times, inputs_at, events
-        )
+            observed, panel, steps, times, inputs, t0, unit, input_times, inputs_at, events,
+            censored,
+        )  # fmt: skip
         record = read_record(system, given, symbolic=True)
         check_rows(record, filter)
         if panel is None:

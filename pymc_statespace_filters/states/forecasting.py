@@ -20,7 +20,7 @@ from ..system.given_record import events_of_records, inputs_with_times, own_inpu
 from ..system.input_columns import (
     inputs_of_other_shape,
     inputs_of_user,
-    n_input_rows,
+    n_rows_of_user,
     only_seen,
 )
 from ..system.labels import table_of
@@ -250,7 +250,7 @@ def _after_past(given: Any, record: RecordAtDraws, axis: TimeAxis) -> Any:
     """The inputs of a record, from step 0 on if they have a row for each step to predict."""
     system = record.variable.system
     past = inputs_of_user(system, record.inputs)
-    n_past, n_rows = n_input_rows(system, record.steps), n_input_rows(system, axis.steps)
+    n_past, n_rows = n_rows_of_user(system, record.steps), n_rows_of_user(system, axis.steps)
     is_future = n_past > 0 and np.shape(given)[:1] == (n_rows - n_past,)
     if not is_future or len(past) > 1 or axis.starts is not None:
         return given

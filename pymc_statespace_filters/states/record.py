@@ -20,7 +20,7 @@ from ..system.input_columns import (
     columns_of_steps,
     flags_at,
     inputs_of_user,
-    n_input_rows,
+    n_rows_of_user,
     with_columns,
 )
 from ..system.model import StateSpaceModel
@@ -123,10 +123,10 @@ class RecordAtDraws:
         """The inputs for the observations of an axis; checked to have the rows they need."""
         system = self.variable.system
         rows = inputs_of_user(system, self.inputs)
-        if len(rows[0]) < n_input_rows(system, axis.steps) and system.n_inputs:
+        if len(rows[0]) < (needed := n_rows_of_user(system, axis.steps)) and system.n_inputs:
             raise ModelError(
                 f"{self.prefix}the model's inputs end after {len(rows[0])} rows, and step "
-                f"{axis.steps[-1]} needs {n_input_rows(system, axis.steps)}: give inputs= for the "
+                f"{axis.steps[-1]} needs {needed}: give inputs= for the "
                 "steps after the data alone, or for all from step 0 on (of the model's inputs with "
                 "times, from the first time on with input_times=)"
             )

@@ -33,6 +33,7 @@ class GivenRecord:
     input_times: Any = None
     inputs_at: Any = "hold"
     events: Any = None
+    censored: Any = None
 
     def current(self) -> "GivenRecord":
         """The same with the current numbers of symbolic steps and labels."""
@@ -73,7 +74,7 @@ class GivenRecord:
     def _own_times(self, records: Records) -> Any:
         """The times that are given, else the dates that the data bring."""
         found = times_of_data(self.observed)
-        for name in ("steps", "times", "panel"):
+        for name in ("steps", "times", "panel", "censored"):
             _check_index(name, getattr(self, name), self.observed)
         if self.steps is not None or self.times is not None:
             if found is not None:
@@ -99,7 +100,8 @@ def _column_of_dates(table: pd.Series | pd.DataFrame) -> str:
 
 def _check_index(name: str, values: Any, observed: Any) -> None:
     """Raise if tables have the same rows in another order, as they are taken by position."""
-    if not (isinstance(values, pd.Series) and isinstance(observed, pd.Series | pd.DataFrame)):
+    tables = (pd.Series, pd.DataFrame)
+    if not (isinstance(values, tables) and isinstance(observed, tables)):
         return
     own, other = values.index, observed.index
     if len(own) == len(other) and not own.equals(other) and own.isin(other).all():

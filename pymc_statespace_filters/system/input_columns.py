@@ -130,7 +130,7 @@ def _check_inputs_of_user(inputs: Any, system: "StateSpaceModel", axis: TimeAxis
     array = table_of("inputs", inputs, system.inputs, "inputs")
     if array.ndim != 2 or array.shape[1] != system.n_inputs:
         raise inputs_of_other_shape(system, np.shape(inputs))
-    needed = n_input_rows(system, axis.steps)
+    needed = n_rows_of_user(system, axis.steps)
     if axis.starts is not None and len(array) not in (needed, axis.starts.size):
         raise ModelError(
             f"inputs must have times of their own (input_times=) where times are off the grid of "
@@ -138,7 +138,7 @@ def _check_inputs_of_user(inputs: Any, system: "StateSpaceModel", axis: TimeAxis
             f"{len(array)} rows"
         )
     if array.shape[0] < needed:
-        last_row = ", and the observation uses u" if system.observation_uses_inputs else ""
+        last_row = ", and the observation uses u" if needed > axis.steps[-1] else ""
         raise ModelError(
             f"inputs must have at least {needed} rows, because the last observation is at step "
             f"{axis.steps[-1]} (row k holds during step k{last_row}), got {array.shape[0]}"
@@ -162,6 +162,8 @@ def with_columns(
         n_rows: Any = axis.starts.size
     elif system.n_inputs:
         n_rows = inputs.shape[-2]
+        if system.is_censored:
+            n_rows = xp.maximum(n_rows, n_input_rows(system, axis.steps))
     else:
         n_rows = n_input_rows(system, at) if xp is np else pt.max(pt.concatenate([at, [0]]))
     columns: list[Any] = [axis.lengths, axis.starts] if axis.starts is not None else []
@@ -175,7 +177,7 @@ def with_columns(
         own = np.broadcast_to(own, (*inputs.shape[:-2], *own.shape))
     if not system.n_inputs:
         return own.copy() if xp is np else own
-    if axis.starts is not None:  # the last row may be missing
+    if axis.starts is not None or system.is_censored:  # the last row may be missing
         inputs = xp.concatenate([inputs, inputs[..., -1:, :]], axis=-2)[..., :n_rows, :]
     return xp.concatenate([inputs, own], axis=-1)
 
@@ -215,7 +217,7 @@ def _columns_of_step(axis: TimeAxis, first: int, n_rows: Any, n_columns: int) ->
         rows = pt.concatenate([known, zeros])[:n_rows]
         return [rows[:, i] for i in range(n_columns)]
     rows = np.zeros((n_rows, n_columns))
-    rows[: len(known)] = known[:n_rows]
+    rows[: len(known), : known.shape[1]] = known[:n_rows]  # without flags, of a future
     return list(rows.T)
 
 
@@ -373,3 +375,10 @@ def n_input_rows(system: "StateSpaceModel", steps: np.ndarray) -> int:
     One per step, and one more if the observation has the argument u.
     """
     return int(steps[-1]) + int(system.observation_uses_inputs) if steps.size else 0
+
+
+def n_rows_of_user(system: "StateSpaceModel", steps: np.ndarray) -> int:
+    """The same of what the user must give: flags alone need no value of inputs at the last step."""
+    if system.is_censored and not system.observation_has_u:
+        return int(steps[-1]) if steps.size else 0
+    return n_input_rows(system, steps)

@@ -20,6 +20,7 @@ from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Variable
 
 from ..errors import ModelError
+from .censoring import check_flags, read_flags, with_flags
 from .checks import shortened
 from .clock import Clock
 from .events import Events
@@ -128,12 +129,23 @@ def read_record(
         given.check_numbers()
     current = given.current()
     records = records_of(current.panel) if current.panel is not None else ALONE
-    placed = current.placed(system, records, earlier)
+    flags = read_flags(given.censored, system)
+    is_censored = flags is not None and bool(flags.any())
+    placed = current.placed(system.censored if is_censored else system, records, earlier)
     axes = placed.axes
     if not records.is_panel:
         records = records._replace(starts=np.array([0, axes[0].steps.size]))
-    data = _read_data(given.observed, system, int(records.starts[-1]))
+    n_rows = int(records.starts[-1])
+    data = _read_data(given.observed, system, n_rows)
     symbol = next((v for v in (given.steps, given.panel) if isinstance(v, Variable)), None)
+    if flags is not None:
+        known = data.get_value() if isinstance(data, SharedVariable) else data
+        check_flags(flags, known, system, n_rows)
+    if flags is not None and is_censored:
+        if symbol is not None:
+            raise ModelError("steps and panel must be numbers beside censored, got a symbol")
+        pairs = zip(axes, records.slices(), strict=True)
+        axes = [with_flags(axis, flags[own], placed.system) for axis, own in pairs]
     inputs, begins = read_inputs(placed.inputs, placed.system, records, axes, symbol)
     n_records, steps = _rows(given, records, axes, begins)
     inputs = only_seen(system, inputs, steps, data)
@@ -219,7 +231,7 @@ def read_inputs(
         raise ModelError(
             "panel, steps and inputs must be numbers in a panel of a system with accumulators, "
             "which are reset at the steps of each record, with events, with parameters that are "
-            "held for several steps, or at times off the grid, got a symbol"
+            "held for several steps, with censored data, or at times off the grid, got a symbol"
         )
     rows = records.check_each(lambda one, axis: check_inputs(one, system, axis, steps), parts, axes)
     if len(rows) == 1 or (not has_own_columns and all(one is parts[0] for one in parts)):
