@@ -66,7 +66,7 @@ def log_likelihood(
         then numbers for all G records, or have a leading dimension G; ``seed`` is one number.
     inputs : array_like, shape (rows, n_inputs)
         Row k holds during step k; in a panel, one such array for all records or one for each.
-    t0, unit, input_times, inputs_at, events
+    t0, unit, input_times, inputs_at, events, censored
         See `StateSpace`.
     seed : int or array_like of int
         Seed of the noise inside the filter, if it has any; broadcasts with the parameters.

@@ -59,7 +59,7 @@ def run_filter(
     filter : a filter of the package, such as EKF, GuidedPF, IMM or FiniteStateFilter
     params : mapping
         A value for every parameter; in a panel of G records, one for all or one for each.
-    observed, steps, times, panel, inputs, t0, unit, input_times, inputs_at, events
+    observed, steps, times, panel, inputs, t0, unit, input_times, inputs_at, events, censored
         The record, or the records of a panel, as in `log_likelihood`.
     seed : int
         Seed of the noise inside the filter, if it has any. The run is that of `log_likelihood` with
