@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..errors import ModelError
 from ..pymc_model.elements import Columns, Elements
-from ..pymc_model.ends_of_support import ends_of_support
+from ..pymc_model.ends_of_support import ends_of_support, falls_to_zero
 from ..pymc_model.prior import is_improper
 from ..pymc_model.switched_density import Switches
 from ..system.checks import is_finite
@@ -90,6 +90,7 @@ def read_candidates(model: pm.Model, absent: Mapping[Any, Any]) -> Candidates:
     candidates = Candidates(elements, Switches(tuple(columns), tuple(values)), keys)
     _check_proper(candidates, model)
     _check_support(candidates, model)
+    _check_density(candidates, model)
     return candidates
 
 
@@ -139,6 +140,28 @@ def _check_support(candidates: Candidates, model: pm.Model) -> None:
             raise ModelError(
                 f"absent must give a value of {elements.labels[column]!r} that its prior permits, "
                 f"from {lower:g} to {upper:g}, got {value:g}"
+            )
+
+
+def _check_density(candidates: Candidates, model: pm.Model) -> None:
+    """Raise if the density of a prior is zero where its term vanishes, as of a LogNormal at zero.
+
+    The model with the term does not contain the one without it then, not even as a limit.
+    """
+    elements, switches = candidates.elements, candidates.switches
+    columns, values = np.concatenate(switches.columns), np.concatenate(switches.values)
+    for name in candidates.variables:
+        own = np.array([i for i, of in enumerate(elements.variables) if of == name])
+        held = switches.held_at(len(elements.variables))[own]
+        falls = falls_to_zero(model[name], held, model)
+        if (without := own[falls & np.isin(own, columns)]).size:
+            label, value = elements.labels[without[0]], values[columns == without[0]][0]
+            prior = model[name].owner.op._print_name[0]
+            raise ModelError(
+                f"the prior of {label!r}, {prior}, has no density at {value:g}, where its term "
+                "vanishes: small terms are improbable under it too. Give a prior with a density "
+                f"there, such as pm.HalfNormal({name!r}, ...) at zero; or compare the evidences of "
+                "two models, with the term and without"
             )
 
 

@@ -111,7 +111,8 @@ def select_terms(
     ------
     ModelError
         If an argument is invalid: a candidate that is no free variable or has no density of its
-        own, a value at which the likelihood is not finite, two candidates that switch off the same
+        own, a value at which the likelihood is not finite or to which the density of the prior
+        falls to zero, as that of a LogNormal does at zero, two candidates that switch off the same
         term.
     DataMismatchError
         If the draws belong to another model, or ranks differ in model, data or seed.

@@ -531,3 +531,46 @@ def test_a_potential_of_a_candidate_is_doubted():
         pm.Normal("y", b, 1.0, observed=[0.5, 1.0])
     with pytest.warns(EvidenceWarning, match="the Potential 'narrow' uses b"):
         psf.select_terms(model, {"b": 0.0}, idata=draws_of(b=0.1), random_seed=1, progressbar=False)
+
+
+def two_sds(prior, **settings):
+    """Two standard deviations of added noise, the second one of another scale."""
+    with pm.Model() as model:
+        scale = pm.HalfNormal("scale", 1)
+        sds = prior("sd", **settings, shape=2), pm.HalfNormal("other", scale)
+        pm.Normal("y", 0.0, (1 + (sds[0] ** 2).sum() + sds[1] ** 2) ** 0.5, observed=[0.5, 1.0])
+    return model
+
+
+@pytest.mark.parametrize(
+    ("prior", "settings"),
+    [
+        (pm.LogNormal, {}),
+        (pm.InverseGamma, {"alpha": 2.0, "beta": 1.0}),
+        (pm.Gamma, {"alpha": [1.0, 1.1], "beta": 1.0}),
+        (pm.Weibull, {"alpha": 2.0, "beta": 1.0}),
+        (pm.LogitNormal, {}),  # whose formula has no number at zero
+    ],
+)
+def test_a_prior_without_density_where_the_term_vanishes_is_refused(prior, settings):
+    model, name = two_sds(prior, **settings), prior.__name__
+    message = rf"prior of 'sd\[1\]', {name}, has no density at 0.*such as pm.HalfNormal\('sd'"
+    with pytest.raises(ModelError, match=message):
+        psf.select_terms(model, {"other": 0.0, "sd[1]": 0.0})
+    read_candidates(model, {"sd[1]": 0.5})
+    if name == "Gamma":
+        read_candidates(model, {"sd[0]": 0.0})  # an exponential
+
+
+def test_the_scale_of_a_prior_decides_nothing_about_its_density_at_zero():
+    """Nor do priors of an infinite density, whose limit PyMC's formula does not have."""
+    with pm.Model() as model:
+        scale = pm.LogNormal("scale")
+        a, b = pm.LogNormal("a", pm.math.log(scale)), pm.Gamma("b", 0.5, scale)
+        c, d = pm.HalfNormal("c", 1e-9), pm.Beta("d", 1, 2 + scale)
+        pm.Normal("y", a + b + c + d, 1.0, observed=[0.5, 1.0])
+    read_candidates(model, dict.fromkeys("bcd", 0.0))
+    with pytest.raises(ModelError, match="prior of 'a', LogNormal"):
+        read_candidates(model, {"a": 0.0})
+    with pytest.raises(ModelError, match="prior of 'd', Beta, has no density at 1"):
+        read_candidates(model, {"d": 1.0})
