@@ -1,11 +1,8 @@
 """Temperatures at which a population passes from one distribution to another."""
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
-from scipy.special import logsumexp
 
 Array = NDArray[np.float64]
 
@@ -28,8 +25,9 @@ def next_temperature(
     before = np.broadcast_to(log_weights, log_likelihood.shape)[is_alive]
 
     def surplus(step: float) -> float:
-        weights = before + step * alive
-        return math.exp(2 * logsumexp(weights) - logsumexp(2 * weights)) / len(alive) - ess_fraction
+        log_weights = before + step * alive
+        weights = np.exp(log_weights - log_weights.max())
+        return float(weights.sum() ** 2 / (weights @ weights) / len(alive)) - ess_fraction
 
     if surplus(1 - temperature) >= 0:
         return 1.0

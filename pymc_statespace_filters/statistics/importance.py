@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
-from scipy.special import chdtri, log_expit, logsumexp, stdtrit
+from scipy.special import chdtri, log_expit, stdtrit
 
 MIN_EFFECTIVE = 100  # effective terms below which a standard error is unreliable
 MAX_PARETO_K = 0.7  # above which it is, however many terms there are
@@ -207,11 +207,14 @@ def bridge_constant(at_draws: Array, at_proposals: Array, log_odds: float) -> fl
     proposals; -inf may be among the ratios at the proposals.
     """
 
+    def log_mean(logs: Array) -> float:
+        # SciPy's logsumexp would import JAX, where it is installed, at every end of chains.
+        return float(np.logaddexp.reduce(logs, axis=None)) - math.log(logs.size)
+
     def excess(log_evidence: float) -> float:
         shift = log_odds - log_evidence
-        upper = logsumexp(log_expit(at_proposals + shift)) - math.log(at_proposals.size)
-        lower = logsumexp(log_expit(-at_draws - shift)) - math.log(at_draws.size)
-        return float(upper - lower - log_odds)
+        upper = log_mean(log_expit(at_proposals + shift))
+        return upper - log_mean(log_expit(-at_draws - shift)) - log_odds
 
     # The evidence lies within the ratios, lowered at most by the fraction of possible proposals.
     possible = at_proposals[~np.isneginf(at_proposals)]

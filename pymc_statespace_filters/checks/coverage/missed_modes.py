@@ -29,7 +29,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 
 from ...smc.kernel import fitted_mixture
 from ...smc.merging import mean_and_error, merged_index, merged_log_evidence
@@ -205,7 +204,8 @@ def explored(
         new = proposals[-1].sample(size, rng)
         x = np.concatenate([x, new])
         log_density = np.append(log_density, evaluate(new, rng))
-        log_weights = log_density - logsumexp([q.log_density(x) for q in proposals], axis=0)
+        of_proposals = np.logaddexp.reduce([q.log_density(x) for q in proposals])
+        log_weights = log_density - of_proposals
         log_weights[excess(x, log_density) < BEYOND] = -np.inf
         fitted = _fitted(x, log_weights, rng)
         if fitted is None:

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 
 from ...compiler.lowering.compiled_system import compile_system
 from ...filters.bootstrap import BootstrapPF
@@ -49,7 +48,7 @@ class Estimates(NamedTuple):
     @property
     def mean(self) -> Array:
         """The log of the mean over seeds, (m,)."""
-        return np.asarray(logsumexp(self.logs, axis=1) - np.log(self.logs.shape[1]))
+        return np.asarray(np.logaddexp.reduce(self.logs, axis=1) - np.log(self.logs.shape[1]))
 
     @property
     def error(self) -> Array:
