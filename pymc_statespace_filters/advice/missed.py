@@ -16,6 +16,7 @@ from ..pymc_model.posterior_draws import (
     unconstrained_draws,
 )
 from ..sampling.output.facts import EndedRun
+from ..sampling.target.target import Target
 from .signs import signs_message, with_both_signs
 from .step_check import step_problems
 from .words import sentences
@@ -73,7 +74,11 @@ def _missed_parts(fact: EndedRun) -> list[str]:
     is_enough = len(flat) >= _LEAST_DRAWS
     if not (is_enough or with_both_signs(model, flat)):
         return []
-    density = ModelDensity(model, moved=noise_was_moved(tree))
+    density: Target | ModelDensity
+    if isinstance(fact.target, Target) and fact.target.evaluates_alone:
+        density = fact.target
+    else:
+        density = ModelDensity(model, moved=noise_was_moved(tree))
     found: list[str] = []
     if is_enough:
         log_density = stats["lp"].transpose("chain", "draw").values.astype(np.float64)

@@ -50,9 +50,11 @@ class VariableAtPoints:
         graphs = {"theta": theta, "steps": steps, "observed": data, "inputs": inputs, "t0": t0}
         free = set(model.free_RVs)
         self._varying = [n for n, graph in graphs.items() if free & set(ancestors([graph]))]
-        first = GraphsAtPoints(model, list(graphs.values()))(x[:1])
-        self._constant = {n: value[0] for n, value in zip(graphs, first, strict=True)}
         self._evaluate = GraphsAtPoints(model, [graphs[n] for n in self._varying])
+        others = [n for n in graphs if n not in self._varying]
+        found = GraphsAtPoints(model, [graphs[n] for n in others])(x[:1])
+        found += self._evaluate(x[:1])
+        self._constant = {n: v[0] for n, v in zip([*others, *self._varying], found, strict=True)}
         self._form = PANEL if steps.type.ndim == 2 else ONE_RECORD
         self._scored = scored_rows(node)
         self._move(x)

@@ -20,7 +20,7 @@ from ...parallel.communicator import Communicator
 from ...parallel.signals import held_interrupts
 from ...pymc_model.graph_rewrites import coarse_filters, expensive_variables, pilot_filters
 from ...pymc_model.inspection import state_space_nodes
-from ..kernel.state import ChainState, RandomBlock, random_block
+from ..kernel.state import ChainState, RandomBlock, draw_seeds, random_block
 from ..kernel.transition import evaluate
 from .leader_follower import check_group
 from .log_density import LogDensity, screening_density, tempered_density
@@ -67,6 +67,7 @@ class Target(SampledModel):
         if group is not None:
             check_group(model, settings, group.size)
         super().__init__(model, vars, settings)
+        self._group = group
         if proposal_cov is None:
             self.first_cov = self.prior_draws.covariance()
         else:
@@ -153,6 +154,17 @@ class Target(SampledModel):
                 evaluate(bound.native)
 
         return evaluation
+
+    @property
+    def evaluates_alone(self) -> bool:
+        """Whether points and fresh seeds are all that an evaluation needs."""
+        return self._group is None and not self.carries_noise
+
+    def evaluate_afresh(self, x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Log-densities (m,) at points (m, d), each with fresh noise; -inf where they fail."""
+        seeds = draw_seeds(rng, (len(x), len(self.seed_names)))
+        found = self.density.at_rows()(x, *seeds.T)[0]
+        return np.where(found < np.inf, found, -np.inf)
 
     def prepare(self) -> None:
         """Load the machine code, and read data and fixed seeds as they are now."""
