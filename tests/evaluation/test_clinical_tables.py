@@ -80,6 +80,22 @@ def test_boluses_are_those_of_the_closed_form():
     assert 1 - near[0] / peak == pytest.approx(np.exp(-2 * K * II))
 
 
+def test_limits_are_those_of_cens():
+    """CENS 1 is a value below DV, -1 one above."""
+    columns = "ID TIME AMT CENS DV"
+    rows = [(1, 0, DOSE, 0, NAN), (1, 1, 0, 1, 62.0), (1, 2, 0, -1, 35.0), (1, 3, 0, 0, 22.0)]
+    table = pd.DataFrame(rows, columns=columns.split())
+    record = read_events(table, observables=["amount"])
+    found = psf.log_likelihood(bolus, psf.EKF(), {"k": K, "sd": 2.0}, **record)
+    at = [DOSE * np.exp(-K * t) for t in (1, 2, 3)]
+    expected = [
+        norm.logcdf(62.0, at[0], 2.0),
+        norm.logsf(35.0, at[1], 2.0),
+        norm.logpdf(22.0, at[2], 2.0),
+    ]
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
 def test_infusions_are_those_of_the_closed_form():
     """Two overlap, and one begins at an observation."""
     infusions = [(0.3, 6.0, 3.0), (1.1, 5.0, 2.0), (4.0, 8.0, 16.0)]
