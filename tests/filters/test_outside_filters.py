@@ -7,13 +7,14 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import pymc as pm
 import pytensor
 import pytest
 from numba import njit
+from numba.core.runtime import _nrt_python, rtsys
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import FilterWarning, ModelError
@@ -23,9 +24,13 @@ from pymc_statespace_filters.filters import (
     ParticleFilter,
     bootstrap,
     enkf,
+    failed,
     member_filter,
     updated,
 )
+from pymc_statespace_filters.filters.ensemble.evaluation import Members
+from pymc_statespace_filters.filters.ensemble.loop import start
+from pymc_statespace_filters.filters.outcomes import NOT_A_NUMBER
 from pymc_statespace_filters.ops.base import evaluator
 from pymc_statespace_filters.ops.states import States
 from tests.waiting import LIMIT
@@ -73,13 +78,33 @@ def observe_as_bootstrap(call, j, k, parts):
     return bootstrap.observe(call, j, k, parts)
 
 
+class Keeping(NamedTuple):
+    members: Members
+    kept: list
+
+
+@njit(error_model="numpy")
+def start_keeping(call):
+    k, (members,) = start(call)
+    return k, Keeping(members, [np.zeros(1), members.X[0]])
+
+
+@njit(error_model="numpy")
+def observe_keeping(call, j, k, parts):
+    """As the bootstrap filter; keeps an array of every row, beside one of the members."""
+    parts.kept.append(call.record.observed[j] + parts.kept[0])
+    if parts.kept[1][0] != parts.members.X[0, 0]:
+        return failed(NOT_A_NUMBER)
+    return bootstrap.observe(call, j, k, parts)
+
+
 @dataclass(frozen=True)
 class OwnPF(ParticleFilter):
-    """The bootstrap filter, by a function of one's own."""
+    """The bootstrap filter, by functions of one's own that keep arrays."""
 
     unbiased: ClassVar[bool] = True
     counts_copies: ClassVar[bool] = True
-    entry: ClassVar = member_filter("own_pf", observe_as_bootstrap)
+    entry: ClassVar = member_filter("own_pf", observe_keeping, start=start_keeping)
 
 
 def test_what_an_outside_filter_is(cubature):
@@ -169,6 +194,17 @@ def test_functions_that_call_those_of_a_filter_have_its_bits(page):
     assert run(inflated(70, inflation=1.3))["sd"][-1, 0] > run(psf.EnKF(70))["sd"][-1, 0]
 
 
+def test_the_memory_of_arrays_that_it_keeps_is_given_back():
+    terms = psf.log_likelihood(SYSTEM, OwnPF(70), {"a": 0.7}, **RUN)
+    _nrt_python.memsys_enable_stats()
+    before = rtsys.get_allocation_stats()
+    again = psf.log_likelihood(SYSTEM, OwnPF(70), {"a": 0.7}, **RUN)
+    after = rtsys.get_allocation_stats()
+    _nrt_python.memsys_disable_stats()
+    np.testing.assert_array_equal(again, terms)
+    assert after.alloc - before.alloc == after.free - before.free > 0
+
+
 # What a user may write wrongly, and what is said.
 THING = object()
 WRONG = {
@@ -248,7 +284,7 @@ def test_an_exception_is_a_failure_that_says_so(monkeypatch):
 
 FILE = """
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 from numba import njit
 from pymc_statespace_filters.filters import ParticleFilter, member_filter, updated
