@@ -166,7 +166,7 @@ def plot_forecast(
         given = {"truth": truth is not None, "n_past": n_past is not None, "errors": errors}
         if others := [argument for argument, is_given in given.items() if is_given]:
             raise ModelError(f"bins must be None beside {' and '.join(others)}, got {bins!r}")
-        draws, record = pooled(idata, group, name, rows, records, model)
+        draws, record, flags = pooled(idata, group, name, rows, records, model)
     elif corrected:
         raise ModelError("corrected must be False without bins, got True")
     else:
@@ -183,9 +183,8 @@ def plot_forecast(
     draws = transformed(draws, "observable", functions)
     record = None if record is None else transformed(record, "observable", functions)
     if record is not None and bins is not None:
-        labels = [f"corrected {text}" for text in texts] if corrected else texts
-        of_picture = {"labels": labels, "x": time, "backend": backend, "pc_kwargs": pc_kwargs}
-        return picture_in_bins(draws, record, bins, corrected, **of_picture)
+        of_picture = {"x": time, "backend": backend, "pc_kwargs": pc_kwargs}
+        return picture_in_bins(draws, record, flags, bins, corrected, texts, **of_picture)
 
     data = draws.to_dataset(name="observations")
     quantiles = over_draws(data)

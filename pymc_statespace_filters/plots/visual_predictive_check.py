@@ -1,6 +1,7 @@
 """Percentiles of the data in bins of time, pooled over records, beside those of replicates."""
 
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,11 @@ KEYS = {5: "5 %, 95 %", 50: "50 %", 95: ""}
 
 def pooled(
     idata: xr.DataTree, group: str, name: str, rows: Rows, records: Any, model: pm.Model | None
-) -> tuple[xr.DataArray, xr.DataArray]:
-    """Return the replicates and the data of rows that have data, over "time" and "observable"."""
+) -> tuple[xr.DataArray, xr.DataArray, xr.DataArray]:
+    """Return replicates, data and their flags, of rows with data, over "time" and "observable".
+
+    A flag is -1 where a true value lies below the limit that is its datum, 1 where above, or 0.
+    """
     if group not in GROUPS:
         raise ModelError(f"group must be one of {list(GROUPS)} with bins, got {group!r}")
     if group == "posterior_predictive" and rows.records is not None:
@@ -39,6 +43,9 @@ def pooled(
         Rows(one.times).over_time(found[name]).rename({found[name].dims[-1]: "observable"})
         for one, found in ((rows, idata[group].to_dataset()), (own, data))
     )
+    constant = idata["constant_data"].to_dataset() if "constant_data" in idata.children else {}
+    censored = constant.get(f"{name}_censored", xr.zeros_like(data[name]))
+    flags = observed.copy(data=censored.values)
     seen = observed.notnull().any("observable").values
     if records is not None:
         shown = rows.choose("records", records).shown
@@ -46,18 +53,22 @@ def pooled(
     if not seen.any():
         raise ModelError("there must be data to compare with replicates, got none")
     replicates = replicates.transpose("chain", "draw", "time", "observable")
-    return replicates.isel(time=seen), observed.isel(time=seen)
+    return replicates.isel(time=seen), observed.isel(time=seen), flags.isel(time=seen)
 
 
 def picture_in_bins(
-    draws: xr.DataArray, data: xr.DataArray, bins: Any, corrected: bool, **of_picture: Any
+    draws: xr.DataArray,
+    data: xr.DataArray,
+    flags: xr.DataArray,
+    bins: Any,
+    corrected: bool,
+    labels: Sequence[str],
+    **of_picture: Any,
 ) -> PlotCollection:
     """Draw percentiles of the data in bins, and medians and 90 % bands of those of replicates."""
-    known, number = data.notnull().values, _bin_of_rows(data["time"].values, bins)
-    if corrected:
-        factors = _corrections(draws, data, known, number)
-        draws, data = draws * factors, data * factors
-    of_draws, of_data = (_percentiles(one, known, number) for one in (draws, data))
+    of_draws, of_data = _in_bins(draws, data, flags, bins, corrected)
+    labels = [f"corrected {label}" for label in labels] if corrected else list(labels)
+    labels += names_of(of_data, "observable")[len(labels) :]
     levels = over_draws(of_draws.to_dataset(name="replicates"))
     low, median, high = (levels.sel(quantile=q, method="nearest") for q in (0.05, 0.5, 0.95))
     ends = interval(low.drop_vars("quantile"), high.drop_vars("quantile"))
@@ -69,7 +80,7 @@ def picture_in_bins(
         above.append(Mark(curve, f"median_{one}", median.sel(percentile=one), DRAWS))
         line = of_data.sel(percentile=one).to_dataset(name="data")
         above.append(Mark(curve, f"data_{one}", line, DATA))
-    return picture_over_time(median.isel(percentile=0), [*below, *above], **of_picture)
+    return picture_over_time(median.isel(percentile=0), [*below, *above], labels, **of_picture)
 
 
 def _bin_of_rows(times: np.ndarray, bins: Any) -> np.ndarray:
@@ -97,42 +108,79 @@ def _bin_of_rows(times: np.ndarray, bins: Any) -> np.ndarray:
     return found
 
 
-def _percentiles(array: xr.DataArray, known: np.ndarray, number: np.ndarray) -> xr.DataArray:
-    """Percentiles of the known values in each bin, at the mean time of its rows; of each draw."""
-    found, means = [], []
+def _in_bins(
+    draws: xr.DataArray, data: xr.DataArray, flags: xr.DataArray, bins: Any, corrected: bool
+) -> list[xr.DataArray]:
+    """Percentiles of each draw and of the data in bins, at the mean times of their rows.
+
+    Behind the observables are the shares below the limit of those that have a single one.
+    """
+    number, names = _bin_of_rows(data["time"].values, bins), names_of(data, "observable")
+    limits = [np.unique(data.values[flags.values[:, i] < 0, i]) for i in range(len(names))]
+    single = [(i, limit[0]) for i, limit in enumerate(limits) if limit.size == 1]
+    none = np.full((3, *draws.shape[:2]), np.nan), np.full(3, np.nan)
+    means, found = [], []
     for one in np.unique(number[number >= 0]):
-        times = array["time"].values[number == one]
+        times = data["time"].values[number == one]
         means.append(times[0] + (times - times[0]).mean())  # numbers or dates
-        for i in range(array.sizes["observable"]):
-            values = array.values[..., known[:, i] & (number == one), i]
-            none = np.full((len(PERCENTILES), *values.shape[:-1]), np.nan)
-            found.append(np.percentile(values, PERCENTILES, axis=-1) if values.size else none)
-    axis = ("time", np.array(means), array["time"].attrs)
-    coords = {"time": axis, "observable": array["observable"], "percentile": list(PERCENTILES)}
-    shape = (len(means), array.sizes["observable"], *found[0].shape)
-    return xr.DataArray(np.reshape(found, shape), coords, (*coords, *array.dims[:-2]))
+        for i, limit in [*((i, None) for i in range(len(names))), *single]:
+            at = {"time": data[:, i].notnull().values & (number == one), "observable": i}
+            replicates, values, flag = draws.isel(at), data.isel(at), flags.isel(at).values
+            if not values.size:
+                found.append(none)
+            elif limit is None:
+                found.append(_percentiles(replicates, values, flag, corrected))
+            else:
+                found.append(_shares(replicates.values < limit, flag < 0))
+    coords = {
+        "time": ("time", np.array(means), data["time"].attrs),
+        "observable": [*names, *(f"share of {names[i]} below its limit" for i, _ in single)],
+        "percentile": list(PERCENTILES),
+    }
+    shape = (len(means), len(names) + len(single), len(PERCENTILES))
+    of_draws, of_data = (np.array(values) for values in zip(*found, strict=True))
+    return [
+        xr.DataArray(values.reshape(*shape, *values.shape[2:]), coords, (*coords, *dims))
+        for values, dims in ((of_draws, draws.dims[:2]), (of_data, ()))
+    ]
 
 
-def _corrections(
-    draws: xr.DataArray, data: xr.DataArray, known: np.ndarray, number: np.ndarray
-) -> np.ndarray:
-    """The median prediction of the bin of each row over the prediction of the row."""
+def _percentiles(
+    draws: xr.DataArray, data: xr.DataArray, flags: np.ndarray, corrected: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Percentiles of the rows of a bin, of each draw (3, chain, draw) and of the data (3,)."""
+    factors = _corrections(draws, data) if corrected else 1.0
+    values = data.values * factors
+    # What a limit leaves open is beyond all others, and a percentile there is not drawn.
+    lower = values[flags < 0].max(initial=-np.inf)
+    upper = values[flags > 0].min(initial=np.inf)
+    values = np.where((flags < 0) | (values < lower), -np.inf, values)
+    values = np.where((flags > 0) | (values > upper), np.inf, values)
+    with np.errstate(invalid="ignore"):
+        of_data = np.percentile(values, PERCENTILES)
+    of_draws = np.percentile(draws.values * factors, PERCENTILES, axis=-1)
+    return of_draws, np.where(np.isfinite(of_data), of_data, np.nan)
+
+
+def _shares(draws: np.ndarray, data: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The shares of the rows of a bin that lie below the limit, in the place of medians."""
+    of_draws, of_data = draws.mean(axis=-1), data.mean()
+    none = np.full_like(of_draws, np.nan)
+    return np.stack([none, of_draws, none]), np.array([np.nan, of_data, np.nan])
+
+
+def _corrections(draws: xr.DataArray, data: xr.DataArray) -> np.ndarray:
+    """The median prediction of a bin over the prediction of each of its rows."""
     predicted = np.median(draws.values, axis=(0, 1))
-    used = known & (number >= 0)[:, None]
     for what, values in (("data", data.values), ("predictions", predicted)):
-        for row, i in np.argwhere(used & ~(values > 0)):
-            name, time = names_of(data, "observable")[i], data["time"].values[row]
+        for row in np.flatnonzero(~(values > 0)):
+            name, time = str(data["observable"].values), data["time"].values[row]
             raise ModelError(
-                f"corrected needs positive {what}, got {values[row, i]:g} of {name!r} at time "
-                f"{time}: leave that time out by edges as bins, or give transform=numpy.exp if "
-                "these are logarithms"
+                f"corrected needs positive {what}, got {values[row]:g} of {name!r} at time {time}: "
+                "leave that time out by edges as bins, or give transform=numpy.exp if these are "
+                "logarithms"
             )
-    factors = np.ones(data.shape)
-    for one, i in np.ndindex(number.max() + 1, data.shape[1]):
-        rows = used[:, i] & (number == one)
-        if rows.any():
-            factors[rows, i] = np.median(predicted[rows, i]) / predicted[rows, i]
-    return factors
+    return np.median(predicted) / predicted
 
 
 def _warn_of_same_records(

@@ -42,7 +42,7 @@ def bands(collection, variable="y0"):
         band, median, data = (
             drawn(collection, f"{visual}_{one}")[variable] for visual in ("band", "median", "data")
         )
-        for curve in (median, data):
+        for curve in filter(None, (median, data)):
             np.testing.assert_array_equal(curve["x"], band["x"])
         parts.append([band["y_bottom"], median["y"], band["y_top"], data["y"]])
     return band["x"], np.moveaxis(parts, 0, -1)
@@ -168,6 +168,63 @@ def test_correction_needs_positive_data(gaussian):
     tree = a_panel(data, draws, np.array([0.0, 1.0, 2.0]), np.arange(3))
     with pytest.raises(ModelError, match=r"positive predictions, got 0 of 'y0' at time 1.0: leave"):
         plot_forecast(tree, bins=[1, 3], corrected=True, **OF_PREDICTIONS)
+
+
+def test_censored_values_are_the_lowest():
+    """What lies above every limit is as of complete data; the rest is not drawn."""
+    rng = np.random.default_rng(6)
+    times = np.repeat([0.0, 1.0, 2.0], 41)  # percentiles are between the 3rd and 4th, ...
+    complete = np.sort(rng.uniform(size=(3, 41)), axis=1)
+    limit = complete[1, 20]  # in bin 1 the median is the lowest value that is seen
+    complete[0] += 1.0  # above the limit
+    draws = rng.uniform(size=(50, 123, 2))
+    data = np.maximum(complete, limit).reshape(-1, 1)
+    flags = -1.0 * (complete < limit).reshape(-1, 1)
+    data, flags = np.hstack([data, draws[0, :, :1]]), np.hstack([flags, np.zeros((123, 1))])
+    tree = a_panel(data, draws, times, np.tile(np.arange(41), 3))
+    tree["constant_data"] = (
+        tree["constant_data"].to_dataset().assign(d_censored=(("d_obs", "observable"), flags))
+    )
+    collection = plot_forecast(tree, bins=3, **OF_PREDICTIONS)
+    _, found = bands(collection)
+    exact = np.percentile(complete, PERCENTILES, axis=1).T
+    assert np.isfinite(found[3]).tolist()[:2] == [[True, True, True], [False, True, True]]
+    np.testing.assert_allclose(found[3][:2], np.where(np.isfinite(found[3]), exact, np.nan)[:2])
+    share = "share of y0 below its limit"
+    shown = {part: drawn(collection, f"{part}_50")[share] for part in ("data", "median", "band")}
+    np.testing.assert_allclose(shown["data"]["y"], (complete < limit).mean(axis=1))
+    replicated = (draws[..., 0] < limit).reshape(50, 3, 41).mean(axis=-1)
+    np.testing.assert_allclose(shown["median"]["y"], np.median(replicated, axis=0))
+    np.testing.assert_allclose(shown["band"]["y_top"], np.quantile(replicated, 0.95, axis=0))
+    labels = drawn(collection, "y_label")
+    assert [labels[name]["string"].replace("\n", " ") for name in ("y0", "y1", share)] == [
+        "y0",
+        "y1",
+        share,
+    ]
+    assert drawn(collection, "band_5")[share] is None
+
+
+def test_limits_that_differ_leave_open_what_is_below_the_largest():
+    """Of 1 to 20 those below 10.5 in one assay of two, and above 15.5 in one, are unknown."""
+    values = np.arange(1.0, 21.0)
+    flags = np.where((values % 2 == 0) & (values < 10.5), -1.0, 1.0 * (values > 15.5))
+    flags[0] = -1.0
+    data = np.where(flags < 0, 10.5, np.where(flags > 0, 15.5, values))
+    data[0] = 1.5  # the limit of the other
+    tree = a_panel(data[:, None], np.ones((3, 20, 1)), np.zeros(20), np.arange(20))
+    tree["constant_data"] = (
+        tree["constant_data"]
+        .to_dataset()
+        .assign(d_censored=(("d_obs", "observable"), flags[:, None]))
+    )
+    collection = plot_forecast(tree, bins=1, **OF_PREDICTIONS)
+    # 50 % is between 10, which is open, and 11; and there is no share below limits that differ.
+    assert "data" not in collection.viz.children
+    assert list(drawn(collection, "y_label")) == ["y0"]
+    tree = tree.isel(d_obs=slice(1, None))
+    points = drawn(plot_forecast(tree, bins=1, **OF_PREDICTIONS), "data")
+    np.testing.assert_array_equal(points["y0"]["y"], [11.0])
 
 
 def test_chosen_records(gaussian):
