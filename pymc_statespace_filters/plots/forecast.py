@@ -65,6 +65,9 @@ def plot_forecast(
     percentiles 5, 50 and 95 of the data, and the median and 90 % band of each of these percentiles
     over replicated data sets. Of a panel with random effects, these are data of new records only
     if the random effects are drawn anew, by ``sample_vars`` of ``pm.sample_posterior_predictive``.
+    Censored values count as the lowest or highest: percentiles beyond a limit are not drawn, and a
+    further panel has the share of the data below the limit, if there is one limit, and that of the
+    replicates.
 
     Parameters
     ----------
