@@ -18,6 +18,7 @@ from ..facts import in_words
 from ..filters.checks import Refusal, check_choice
 from ..filters.protocol import Filter, properties
 from ..filters.written import short_form
+from ..system.censoring import read_flags
 from ..system.checks import is_integer
 from ..system.clock import Clock
 from ..system.events import Events
@@ -104,7 +105,8 @@ class StateSpace(Continuous):
     censored : array_like, shape (J, p) or (J,), optional
         -1 where the true value lies below the number in ``observed``, 1 where above, 0 elsewhere,
         as for a limit of detection; columns are aligned as those of ``observed``. Of a count, -1
-        means at most, and 1 at least the number. See Notes.
+        means at most, and 1 at least the number. The model stores it for plots, as data
+        ``{name}_censored``. See Notes.
     seed : int
         Seed of the noise inside the filter; in a panel, the noise of each record depends on it and
         on the record's label. The model stores it as shared data ``{name}_seed``,
@@ -229,6 +231,9 @@ class StateSpace(Continuous):
         _add_coord(model, component_dim, list(system.observables), name)
         if panel is not None:
             _add_records(model, full_name, row_dim, record)
+        if record.system.is_censored:
+            flags = pytensor.shared(read_flags(censored, system), name=f"{full_name}_censored")
+            model.register_data_var(flags, dims=(row_dim, component_dim))
         noise_seed: Any = seed_array
         if filter.noisy:
             noise_seed = make_seed(full_name, seed_array)

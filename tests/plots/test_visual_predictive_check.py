@@ -281,6 +281,7 @@ def test_what_is_refused(gaussian):
 
 
 N_FITTED, N_PER_PERSON = 40, 4
+LIMIT = 2.2  # of detection
 
 
 @pytest.fixture(scope="module")
@@ -293,6 +294,7 @@ def fitted():
         observation_noise=[[0.25]],
         initial_mean=lambda level, shift: [level + shift],
         initial_cov=[[0.0]],
+        observables=["y"],
     )
     labels = np.repeat(np.arange(N_FITTED), N_PER_PERSON)
     rng = np.random.default_rng(4)
@@ -301,9 +303,10 @@ def fitted():
         z = pm.Normal("z", dims="person")
         pm.Deterministic("level", 3.0 + spread * z, dims="person")
         pm.Normal("shift", 0.0, spread, dims="person")  # centred
+        data = 3.0 + 0.5 * rng.normal(size=(labels.size, 1))
         psf.StateSpace(
             "d", system, psf.EKF(), panel=labels, steps=np.tile(np.arange(1, 5), N_FITTED),
-            observed=3.0 + 0.5 * rng.normal(size=(labels.size, 1)),
+            observed=np.maximum(data, LIMIT), censored=-1.0 * (data < LIMIT),
         )  # fmt: skip
     people = {
         name: (("chain", "draw", "person"), 0.01 * rng.normal(size=(1, 500, N_FITTED)))
@@ -343,7 +346,14 @@ def test_people_are_drawn_from_the_population(fitted):
     new = tree["posterior_predictive"]
     np.testing.assert_allclose(new["level"].values, 3.0 + 2.0 * new["z"].values)
     for given in (None, model):
-        plot_forecast(tree, bins=2, model=given, **OF_PREDICTIONS)
+        collection = plot_forecast(tree, bins=2, model=given, **OF_PREDICTIONS)
+    share = {
+        part: drawn(collection, f"{part}_50")["share of y below its limit"]["y"].mean()
+        for part in ("data", "median")
+    }
+    np.testing.assert_allclose(share["data"], (tree["observed_data"]["d"].values == LIMIT).mean())
+    # Replicates are not censored: their sd is that of a person's sum of effects and noise.
+    np.testing.assert_allclose(share["median"], norm.cdf((LIMIT - 3.0) / 8.25**0.5), atol=0.03)
     names = {"var_names": ["z", "shift", "level", "d"]}  # shows copies of the posterior
     call = r"sample_vars=\['z', 'shift', 'level', 'd'\]"
     for variables in ({}, names):
