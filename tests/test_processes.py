@@ -6,7 +6,7 @@ import os
 import pickle
 import subprocess
 import sys
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import cloudpickle
@@ -155,19 +155,16 @@ def run(tmp_path):
     return run
 
 
-def test_machine_code_is_found_again_and_never_mixed_up(run, tmp_path):
-    """Of two processes one compiles a function; other data and constants meet what was kept."""
+def test_machine_code_is_found_again_and_never_mixed_up(run):
+    """A second process compiles nothing; other data and constants meet what the first one kept."""
     data, other_data = FORCED_DATA.tolist(), (2 * FORCED_DATA).tolist()
-    with ThreadPoolExecutor(2) as both:
-        (cold, found, _, _), (same, found_there, _, _) = both.map(run, [[{}, data]] * 2)
-    assert same == cold
+    cold, found, machine_code, _ = run([{}, data])
     terms, _, key = cold
+    assert machine_code
     assert len(found) > 1
-    assert [a + b for a, b in zip(found, found_there, strict=True)] == [1] * len(found)
+    assert not any(found)
     np.testing.assert_allclose(terms, forced_terms(0.6), rtol=1e-12)
 
-    machine_code = sorted(path.name for path in tmp_path.rglob("*.nb[ci]"))
-    assert machine_code
     warm, found_again, same_machine_code, (other,) = run(
         [{}, data], [{"observation_noise": [[0.6]]}, other_data]
     )

@@ -21,6 +21,8 @@ from pymc_statespace_filters.compiler.native import entry_point
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from tests.waiting import LIMIT
 
+ROOT = Path(__file__).parents[3]
+
 
 def _nothing(n):
     pass
@@ -41,10 +43,10 @@ def test_a_damaged_file_is_compiled_anew(ending):
     assert len(file.read_bytes()) > 0.9 * len(whole)  # for the next process
 
 
-def made(needs=()):
-    """An entry point that nobody has compiled."""
+def made(needs=(), text=None):
+    """An entry point that nobody has compiled, unless one of this text."""
     inside = FunctionType(_nothing.__code__, {"__name__": entry_point.__name__}, "_nothing")
-    return EntryPoint(inside, {"n": types.intp}, "nothing", (uuid4().hex,), needs)
+    return EntryPoint(inside, {"n": types.intp}, "nothing", (text or uuid4().hex,), needs)
 
 
 def test_it_is_known_what_needs_no_compilation():
@@ -86,6 +88,34 @@ def owner():
             return process, Path(path)
 
         yield owner
+
+
+COMPILE = """
+import sys
+from pymc_statespace_filters.compiler.native import entry_point
+from tests.compiler.native.test_cache_files import made
+
+compiled = made(text=sys.argv[1])._callback()
+with entry_point._one_process(compiled):
+    print("begun", flush=True)
+    sys.stdin.readline()
+    compiled.compile()
+"""
+
+
+def test_who_waits_for_a_process_that_compiles_loads_its_code():
+    text = uuid4().hex
+    command = [sys.executable, "-c", COMPILE, text]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT, text=True
+    ) as other:
+        assert other.stdout.readline() == "begun\n"
+        timer = Timer(0.2, other.stdin.close)
+        timer.start()
+        point = made(text=text)
+        point.compile()
+        assert not timer.is_alive()
+    assert entry_point._compiled[point.symbol].cache_hits == 1
 
 
 def test_who_waits_for_a_process_that_is_killed_compiles(owner):
