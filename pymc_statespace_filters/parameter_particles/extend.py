@@ -12,10 +12,17 @@ from ..filters.checks import check_system_and_filter
 from ..parallel.signals import keeps_what_is_there
 from ..pymc_model.filter_rows import Record
 from ..pymc_model.inspection import given_model
+from ..system.censoring import read_flags
 from ..system.checks import check_flag, check_random_seed
 from ..system.clock import times_of_data
 from ..system.given_record import GivenRecord
-from ..system.input_columns import inputs_of_user, resets_at, with_resets
+from ..system.input_columns import (
+    columns_of_steps,
+    flags_at,
+    inputs_of_user,
+    resets_at,
+    with_resets,
+)
 from ..system.placement import Earlier
 from ..system.record import check_observed, read_record
 from ..system.steps import GRID_TOLERANCE, check_steps
@@ -36,6 +43,7 @@ def extend(
     times: Any = None,
     inputs: Any = None,
     events: Any = None,
+    censored: Any = None,
     random_seed: int | np.random.Generator | None = None,
     progressbar: bool = True,
 ) -> xr.DataTree:
@@ -61,6 +69,8 @@ def extend(
         Inputs of all rows, old and new, by step.
     events : DataFrame or mapping of columns, optional
         Events after the last row seen, as in `StateSpace`; by default the later ones of the model.
+    censored : array_like, optional
+        Which of these values are censored, as in `StateSpace`, of a model with censored data.
     random_seed : int or numpy.random.Generator, optional
         Seed of the rows to come; by default that of the run, which makes it one with them.
     progressbar : bool
@@ -123,7 +133,7 @@ def extend(
     rows = progress.rows
     if times is None and steps is None:
         times = times_of_data(observed)
-    record = _longer(rows, _new_rows(rows, observed, steps, times, inputs, events))
+    record = _longer(rows, _new_rows(rows, observed, steps, times, inputs, events, censored))
     if random_seed is not None:
         entropy = check_random_seed(random_seed).integers(2**63, size=2).tolist()
         request = request._replace(entropy=tuple(entropy))
@@ -133,7 +143,13 @@ def extend(
 
 
 def _new_rows(
-    rows: ObservedRows, observed: Any, steps: Any, times: Any, inputs: Any, events: Any
+    rows: ObservedRows,
+    observed: Any,
+    steps: Any,
+    times: Any,
+    inputs: Any,
+    events: Any,
+    censored: Any,
 ) -> Record:
     """The rows that come after those seen, as a record of their own; the others must agree."""
     system, clock = rows.variable.system, rows.variable.clock
@@ -156,9 +172,16 @@ def _new_rows(
     earlier = Earlier(clock, float(rows.record.t0), [int(rows.record.steps[-1])], ends)
     if events is None and rows.variable.events:
         (events,) = rows.variable.events
+    flags = read_flags(censored, system)
+    if flags is not None and not system.is_censored:
+        raise ModelError(
+            "censored must be None where no row of the run so far is censored: run sample_smc over "
+            "all rows"
+        )
     new = GivenRecord(
-        values[n_old:], **{name: given[n_old:]}, inputs=inputs, t0=earlier.t0, events=events
-    )
+        values[n_old:], **{name: given[n_old:]}, inputs=inputs, t0=earlier.t0, events=events,
+        censored=None if flags is None else flags[n_old:],
+    )  # fmt: skip
     found = read_record(system, new, earlier)
     if found.system.has_instant_steps:
         check_system_and_filter(found.system, rows.variable.filter)
@@ -205,5 +228,7 @@ def _longer(rows: ObservedRows, new: Record) -> Record:
             )
         inputs[:last] = seen.inputs[:last]
         inputs[last] = with_resets(system, inputs[last], resets_at(system, seen.observed[-1]))
+        if system.is_censored and (columns := columns_of_steps(system, inputs)) is not None:
+            columns[last, -system.p :] = flags_at(system, seen.inputs, [last])  # of inputs: a view
     steps = np.concatenate([seen.steps, new.steps])
     return Record(steps, np.concatenate([seen.observed, new.observed]), inputs, seen.t0)

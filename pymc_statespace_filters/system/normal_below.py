@@ -11,6 +11,7 @@ and accurate however far the limit is; ``impl`` is the slow form, for constants 
 graphs.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -18,87 +19,66 @@ import pytensor.scalar as ps
 from pytensor.tensor.elemwise import Elemwise
 from scipy import special
 
-_FAR = -3.0  # below which differences of nearly equal numbers would lose digits
-_N_FRACTIONS = 60
-
-
-def _double(*types: Any) -> tuple:
-    return (ps.float64,)
-
 
 class NormalBelow(ps.ScalarOp):
-    """A function of the limit z."""
+    """A function of the limit z, by the name of its machine code."""
 
     nin = 1
-    machine_code: str
 
-    def __init__(self, output_types_preference: Any = None, name: str | None = None) -> None:
-        super().__init__(_double, name or type(self).__name__)
+    def __init__(self, machine_code: str) -> None:
+        super().__init__(ps.upgrade_to_float, machine_code)
+        self.machine_code = machine_code
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, NormalBelow) and self.machine_code == other.machine_code
 
-class LogProbability(NormalBelow):
-    """log Φ(z)."""
+    def __hash__(self) -> int:
+        return hash((NormalBelow, self.machine_code))
 
-    machine_code = "normal_log_probability"
+    def impl(self, z: float) -> float:
+        """The value at a number."""
+        return float(_VALUES[self.machine_code](z))
 
-    def impl(self, z: float) -> float:  # noqa: D102
-        return float(special.log_ndtr(z))
-
-    def pullback(self, inputs: list, outputs: list, cotangents: list) -> list:  # noqa: D102
-        return [cotangents[0] * _hazard(*inputs)]
-
-
-class Hazard(NormalBelow):
-    """φ(z) / Φ(z)."""
-
-    machine_code = "normal_hazard"
-
-    def impl(self, z: float) -> float:  # noqa: D102
-        return float(np.sqrt(2.0 / np.pi) / special.erfcx(-z / np.sqrt(2.0)))
-
-    def pullback(self, inputs: list, outputs: list, cotangents: list) -> list:  # noqa: D102
-        return [-cotangents[0] * outputs[0] * _excess(*inputs)]
+    def pullback(self, inputs: list, outputs: list, cotangents: list) -> list:
+        """The derivative, by the other operations."""
+        return [cotangents[0] * _SLOPES[self.machine_code](*inputs)]
 
 
-class Excess(NormalBelow):
-    """z + φ(z) / Φ(z)."""
-
-    machine_code = "normal_excess"
-
-    def impl(self, z: float) -> float:  # noqa: D102
-        return 1.0 / (_fraction(-z) - z) if z < _FAR else z + _hazard.impl(z)
-
-    def pullback(self, inputs: list, outputs: list, cotangents: list) -> list:  # noqa: D102
-        return [cotangents[0] * _variance(*inputs)]
-
-
-class Variance(NormalBelow):
-    """The variance of Z given Z < z."""
-
-    machine_code = "normal_variance_below"
-
-    def impl(self, z: float) -> float:  # noqa: D102
-        excess = _excess.impl(z)
-        if z < _FAR:
-            return excess * (_fraction(-z) - excess)
-        return 1.0 - _hazard.impl(z) * excess
-
-    def pullback(self, inputs: list, outputs: list, cotangents: list) -> list:  # noqa: D102
-        excess = _excess(*inputs)
-        return [cotangents[0] * _hazard(*inputs) * (excess * excess - outputs[0])]
+_log_probability, _hazard, _excess, _variance = map(
+    NormalBelow,
+    ("normal_log_probability", "normal_hazard", "normal_excess", "normal_variance_below"),
+)
+log_probability, hazard, excess, variance = map(
+    Elemwise, (_log_probability, _hazard, _excess, _variance)
+)
+_SLOPES: dict[str, Callable[[Any], Any]] = {
+    "normal_log_probability": _hazard,
+    "normal_hazard": lambda z: -_hazard(z) * _excess(z),
+    "normal_excess": _variance,
+    "normal_variance_below": lambda z: _hazard(z) * (_excess(z) * _excess(z) - _variance(z)),
+}
 
 
 def _fraction(x: float) -> float:
     """Laplace's continued fraction 2 / (x + 3 / (x + ...)), which is 1 / e - x."""
     rest = 0.0
-    for k in range(_N_FRACTIONS, 1, -1):
+    for k in range(60, 1, -1):
         rest = k / (x + rest)
     return rest
 
 
-_hazard, _excess, _variance = Hazard(), Excess(), Variance()
+def _excess_at(z: float) -> float:
+    """The excess; far below zero, differences of nearly equal numbers would lose digits."""
+    return 1.0 / (_fraction(-z) - z) if z < -3.0 else z + _hazard.impl(z)
 
-log_probability = Elemwise(LogProbability())
-hazard = Elemwise(_hazard)
-excess = Elemwise(_excess)
-variance = Elemwise(_variance)
+
+_VALUES: dict[str, Callable[[float], float]] = {
+    "normal_log_probability": special.log_ndtr,
+    "normal_hazard": lambda z: np.sqrt(2.0 / np.pi) / special.erfcx(-z / np.sqrt(2.0)),
+    "normal_excess": _excess_at,
+    "normal_variance_below": lambda z: (
+        _excess_at(z) * (_fraction(-z) - _excess_at(z))
+        if z < -3.0
+        else 1.0 - _hazard.impl(z) * _excess_at(z)
+    ),
+}

@@ -22,6 +22,7 @@ def panel_from(
     dt: float | None = None,
     t0: Any = 0.0,
     unit: Any = None,
+    censored: str | Sequence[str] | None = None,
 ) -> dict[str, Any]:
     """Arguments of a panel from a table in long format, one row for each observation.
 
@@ -42,13 +43,15 @@ def panel_from(
     t0, unit
         Time of step 0, and the duration of one unit of model time, for dates, see `StateSpace`. By
         default a record with dates starts at its first row.
+    censored : str or sequence of str, optional
+        The column of the flags of each column of ``values``, see `StateSpace`.
 
     Returns
     -------
     dict
         The arguments ``panel``, ``steps`` or ``times``, and ``observed`` (J, p) of `StateSpace`,
-        `log_likelihood` and `run_filter`, and ``t0`` and ``unit``. Records are in the order of
-        their first rows, the rows of each by time.
+        `log_likelihood` and `run_filter`, and ``t0``, ``unit`` and ``censored``. Records are in the
+        order of their first rows, the rows of each by time.
 
     Raises
     ------
@@ -78,7 +81,11 @@ def panel_from(
     if not isinstance(frame, pd.DataFrame):
         raise ModelError(f"frame must be a pandas.DataFrame, got {type(frame).__name__}")
     columns = [values] if isinstance(values, str) else list(values)
-    for argument, names in (("record", [record]), ("time", [time]), ("values", columns)):
+    flags = [censored] if isinstance(censored, str) else list(censored or columns)
+    if len(flags) != len(columns):
+        raise ModelError(f"censored must name a column for each of {columns}, got {flags}")
+    roles = (("record", [record]), ("time", [time]), ("values", columns), ("censored", flags))
+    for argument, names in roles:
         if missing := [name for name in names if name not in frame.columns]:
             raise ModelError(
                 f"{argument} must name columns of frame, {list(frame.columns)}, got {missing}"
@@ -97,8 +104,12 @@ def panel_from(
         )
     times = frame[time] if has_dates else pd.Series(_floats(frame, [time])[:, 0])
     order = np.lexsort([times.to_numpy(), numbers])
-    labels, data = np.asarray(frame[record])[order], observed[order]
-    named = data if len(columns) == 1 else pd.DataFrame(data, columns=columns)
+    labels, tables = np.asarray(frame[record])[order], {"observed": observed[order]}
+    if censored is not None:
+        tables["censored"] = _floats(frame, flags)[order]
+    named: dict[str, Any] = dict(tables)
+    if len(columns) > 1:
+        named = {name: pd.DataFrame(own, columns=columns) for name, own in tables.items()}
     records = records_of(labels)
     parts = [
         _times(frame, order[rows], times.iloc[order[rows]], label)
@@ -107,7 +118,7 @@ def panel_from(
     if dt is None:
         at = times.iloc[order]
         when = {"times": pd.DatetimeIndex(at) if has_dates else at.to_numpy()}
-        return {"panel": labels, **when, "observed": named, "t0": t0, "unit": unit}
+        return {"panel": labels, **when, **named, "t0": t0, "unit": unit}
     steps = [
         _steps(frame, order[rows], own, label, dt, t0, unit)
         for label, rows, own in zip(records.labels, records.slices(), parts, strict=True)
@@ -115,7 +126,7 @@ def panel_from(
     return {
         "panel": labels,
         "steps": np.concatenate(steps),
-        "observed": named,
+        **named,
         "t0": 0.0 if are_dates(t0) else t0,
     }
 

@@ -185,33 +185,80 @@ FALLING = psf.StateSpaceModel(
 )
 
 
-def test_a_deterministic_system_has_sums_of_distribution_functions():
-    """At times on the grid and off it; inputs hold during the steps before an observation alone."""
+def sums_of_distribution_functions(y, flags, x, sd):
+    """Terms of independent Gaussian sensors around known values."""
+    law = stats.norm(x, sd)
+    terms = np.where(flags == 0, law.logpdf(y), np.where(flags < 0, law.logcdf(y), law.logsf(y)))
+    return np.nansum(terms, axis=1)
+
+
+@pytest.mark.parametrize("times", [[0.4, 1.1, 1.8], [0.33, 1.1, 1.777]], ids=["grid", "any"])
+def test_a_deterministic_system_has_sums_of_distribution_functions(times):
+    """Inputs by step are those of the steps before the last observation alone."""
     theta, y = {"k": 0.7, "x0": 2.0, "r": 0.2}, np.array([[1.2, 2.0], [1.0, np.nan], [0.5, 0.1]])
     flags = np.array([[-1, 0], [1, 0], [0, 1]])
-    for times in (np.array([0.4, 1.1, 1.8]), np.array([0.33, 1.1, 1.777])):
-        x = 2.0 * np.exp(-0.7 * times) + 0.3 / 0.7 * (1.0 - np.exp(-0.7 * times))
-        law = [stats.norm(x, 0.2), stats.norm(x**2, 0.3**0.5)]
-        expected = [
-            law[0].logcdf(y[:, 0])[0] + law[1].logpdf(y[:, 1])[0],
-            law[0].logsf(y[:, 0])[1],
-            law[0].logpdf(y[:, 0])[2] + law[1].logsf(y[:, 1])[2],
-        ]
-        inputs = {"inputs": np.full(18, 0.3)}
-        if times[0] == 0.33:
-            inputs = {"inputs": [0.3, 0.3], "input_times": [0.0, 5.0]}
-        given = {"times": times, "censored": flags, **inputs}
-        terms = psf.log_likelihood(FALLING, psf.EKF(), theta, y, **given)
-        np.testing.assert_allclose(terms, expected, atol=1e-6)  # of the Runge-Kutta steps
-        known = psf.simulate(FALLING, theta, times=times, noise=False, **inputs)
-        x = known["observations"].values[:, 0]
-        law = [stats.norm(x, 0.2), stats.norm(x**2, 0.3**0.5)]
-        expected = [
-            law[0].logcdf(y[0, 0])[0] + law[1].logpdf(y[0, 1])[0],
-            law[0].logsf(y[1, 0])[1],
-            law[0].logpdf(y[2, 0])[2] + law[1].logsf(y[2, 1])[2],
-        ]
-        np.testing.assert_allclose(terms, expected, atol=1e-10)
+    inputs = {"inputs": np.linspace(0.1, 0.5, 18)}
+    if times[0] == 0.33:
+        inputs = {"inputs": [0.3, 0.2], "input_times": [0.0, 1.0]}
+    known = psf.simulate(FALLING, theta, times=times, noise=False, **inputs)
+    terms = psf.log_likelihood(FALLING, psf.EKF(), theta, y, times=times, censored=flags, **inputs)
+    expected = sums_of_distribution_functions(y, flags, known["observations"], [0.2, 0.3**0.5])
+    np.testing.assert_allclose(terms, expected, atol=1e-10)
+
+
+def test_flags_have_columns_beside_events_sums_and_drifting_parameters():
+    system = psf.StateSpaceModel(
+        psf.RungeKutta4(lambda x, k: [-k * x[0], x[0]], dt=0.1),
+        lambda x: [x[0], x[1]],
+        observation_noise=np.diag([0.04, 0.09]),
+        initial_mean=[2.0, 0.0],
+        initial_cov=np.zeros((2, 2)),
+        states=["level", "sum"],
+        accumulators=["sum"],
+        event=lambda x, dose: [x[0] + dose, x[1]],
+        events=["dose"],
+    )
+    times, flags = [0.4, 1.1, 1.8], np.array([[-1, 1], [0, -1], [1, 0]])
+    given = {"times": times, "events": {"time": [0.4, 1.5], "dose": [1.0, 0.5]}}
+    known = psf.simulate(system, {"k": 0.7}, noise=False, **given)
+    y = known["observations"].values + np.array([[0.1, -0.2], [0.3, 0.1], [0.1, 0.2]])
+    expected = sums_of_distribution_functions(y, flags, known["observations"], [0.2, 0.3])
+    terms = psf.log_likelihood(system, psf.EKF(), {"k": 0.7}, y, censored=flags, **given)
+    np.testing.assert_allclose(terms, expected, atol=1e-10)
+    drifting = psf.drifting(system, k=psf.RandomWalk(scale="log", every=4))
+    theta = {"k": 0.7, "k_strength": 1e-9}
+    terms = psf.log_likelihood(drifting, psf.EKF(), theta, y, censored=flags, **given)
+    np.testing.assert_allclose(terms, expected, atol=1e-6)
+
+
+REGIMES = psf.StateSpaceModel(
+    transition=lambda x, q, a, s: [a * x[0] + q[0] + s * q[1], q[0]],
+    process_dist=lambda x: [pm.Bernoulli.dist(0.2 + 0.5 * x[1]), pm.Normal.dist()],
+    observation=lambda x: [x[0]],
+    observation_noise=[[NOISE[0] ** 2]],
+    initial_dist=lambda: [pm.Normal.dist(), 0],
+)
+
+
+def test_filters_of_regimes_go_on_with_truncated_moments(data):
+    """Against a dense grid of both states; one observation at every step."""
+    y, flags = data[ONE]
+    width, jump = GRID[1] - GRID[0], np.array([[0.8, 0.2], [0.3, 0.7]])
+    mass = np.stack([stats.norm.pdf(GRID), 0.0 * GRID]) * width
+    to = [stats.norm.pdf(GRID[:, None], 0.8 * GRID + r, 0.6) * width for r in (0, 1)]
+    exact = 0.0
+    densities = gaussian_densities(y[:8], flags[:8], [1.0])
+    for k, density in enumerate(densities):
+        if k:
+            mass = np.stack([to[r] @ (jump[:, r] @ mass) for r in (0, 1)])
+        mass = mass * density
+        exact += np.log(mass.sum())
+        mass = mass / mass.sum()
+    for filter in (psf.IMM(), psf.RBPF(400)):
+        given = {"steps": np.arange(8), "censored": flags[:8]}
+        found = psf.log_likelihood(REGIMES, filter, TRUE, y[:8], **given).sum()
+        assert 1e-6 < abs(found - exact) < 0.1
+        assert not filter.is_exact_for(compile_system(REGIMES.censored))
 
 
 def value_and_gradient(model, point):
