@@ -46,19 +46,19 @@ def log_likelihood(system, filter, y, flags, **others):
 
 @pytest.fixture(scope="module")
 def path():
-    """A path of the AR(1) process at the steps, and normals."""
+    """A path of the AR(1) process at the steps."""
     rng = np.random.default_rng(3)
     x = [rng.normal()]
     while len(x) <= STEPS[-1]:
         x.append(TRUE["a"] * x[-1] + TRUE["s"] * rng.normal())
-    return np.array(x)[STEPS], rng
+    return np.array(x)[STEPS]
 
 
 @pytest.fixture(scope="module")
 def record(path):
     """Two sensors, of which about 30 % lie below a limit, some above another, and some are NaN."""
-    x, rng = path
-    y = np.stack([x, -2.0 * x], axis=1) + NOISE * rng.normal(size=(len(x), 2))
+    rng = np.random.default_rng(4)
+    y = np.stack([path, -2.0 * path], axis=1) + NOISE * rng.normal(size=(len(path), 2))
     low, high = np.quantile(y, 0.3, axis=0), np.quantile(y, 0.9, axis=0)
     flags = np.where(y < low, -1, np.where(y > high, 1, 0))
     y = np.clip(y, low, high)
@@ -69,8 +69,7 @@ def record(path):
 @pytest.fixture(scope="module")
 def counts(path):
     """Counts, recorded as 1 where at most 1, and as 4 where at least 4."""
-    x, rng = path
-    y = rng.poisson(np.exp(0.5 + x)).astype(float)
+    y = np.random.default_rng(5).poisson(np.exp(0.5 + path)).astype(float)
     flags = np.where(y <= 1, -1, np.where(y >= 4, 1, 0))
     return np.clip(y, 1, 4)[:, None], flags[:, None]
 
@@ -437,3 +436,41 @@ def test_simulations_and_symbolic_steps_take_no_flags():
             psf.StateSpace(
                 "d", ONE, psf.EKF(), params=TRUE, steps=steps, observed=[0, 0], censored=[-1, 0]
             )
+
+
+def test_rows_that_extend_a_run_keep_the_flags_of_those_before(data):
+    """The run over five rows, of which the last is censored, and three more is that over eight."""
+    y, flags = (part[17:25] for part in data[ONE])
+    assert flags[4] != 0
+    assert (flags[5:] != 0).any()
+
+    def run_over(rows):
+        with pm.Model() as model:
+            pm.Uniform("a", 0.5, 1.0)
+            given = {"observed": y[rows], "censored": flags[rows], "steps": np.arange(8)[rows]}
+            psf.StateSpace("d", ONE, psf.EKF(), params={"s": 0.6}, **given)
+            settings = {"data": "sequential", "populations": 2, "random_seed": 1}
+            return model, psf.sample_smc(60, progressbar=False, **settings)
+
+    model, run = run_over(slice(0, 5))
+    longer = {"observed": y, "steps": np.arange(8), "progressbar": False}
+    found = psf.extend(run, model, censored=flags, **longer)
+    expected = run_over(slice(0, 8))[1]
+    assert found.attrs["log_evidence"] == pytest.approx(expected.attrs["log_evidence"], abs=1e-9)
+    without = psf.extend(run, model, **longer)
+    assert abs(without.attrs["log_evidence"] - expected.attrs["log_evidence"]) > 0.1
+
+
+def test_a_table_in_long_format_has_columns_of_flags():
+    frame = pd.DataFrame({
+        "who": ["A", "B", "A", "B"], "t": [2.0, 1.0, 0.0, 2.0], "v": [1.0, 2, 3, 4],
+        "w": [5.0, 6, 7, 8], "cv": [0, -1, 1, 0], "cw": [1, 0, 0, -1],
+    })  # fmt: skip
+    columns = {"record": "who", "time": "t", "dt": 1.0}
+    found = psf.panel_from(frame, values=["v", "w"], censored=["cv", "cw"], **columns)
+    expected = pd.DataFrame({"v": [1.0, 0, -1, 0], "w": [0.0, 1, 0, -1]})
+    pd.testing.assert_frame_equal(found["censored"], expected)
+    one = psf.panel_from(frame, values="v", censored="cv", **columns)
+    np.testing.assert_array_equal(one["censored"].ravel(), [1, 0, -1, 0])
+    with pytest.raises(ModelError, match=r"a column for each of \['v', 'w'\], got \['cv'\]"):
+        psf.panel_from(frame, values=["v", "w"], censored="cv", **columns)
