@@ -30,9 +30,10 @@ def test_posteriors_unlike_a_normal_law(make):
     assert not found.doubts
 
 
-def test_a_noisy_likelihood_gives_the_evidence_of_its_expectation():
+def test_draws_are_never_evaluated_again():
+    """Fresh points alone, each evaluated once."""
     rng = np.random.default_rng(55)
-    posterior = gaussian(2, (4, 5000), rng, noise_sd=1.0)
+    posterior = gaussian(2, (4, 500), rng, noise_sd=1.0)
     seen = []
 
     def evaluate(x, rng):
@@ -40,11 +41,9 @@ def test_a_noisy_likelihood_gives_the_evidence_of_its_expectation():
         return posterior.evaluate(x, rng)
 
     importance = Importance()
-    found = importance.estimate(replace(posterior, evaluate=evaluate), rng=rng)
-    assert abs(found.log_evidence - LOG_EVIDENCE) < 4 * found.se < 0.06
-    # Fresh points alone, each evaluated once.
+    importance.estimate(replace(posterior, evaluate=evaluate), rng=rng)
     points = {tuple(x) for x in np.concatenate(seen)}
-    assert len(points) == importance.n_evaluations(posterior)
+    assert len(points) == sum(map(len, seen)) == importance.n_evaluations(posterior)
     assert points.isdisjoint(map(tuple, posterior.draws.reshape(-1, 2)))
 
 
