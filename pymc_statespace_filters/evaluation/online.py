@@ -18,7 +18,8 @@ from ..errors import ModelError
 from ..filters.checks import check_choice
 from ..filters.outcomes import NONE, Failure
 from ..filters.protocol import Filter
-from ..system.checks import check_finite, check_random_seed
+from ..system.checks import check_random_seed
+from ..system.clock import Clock, are_dates, clock_and_start
 from ..system.model import StateSpaceModel
 from ..system.parameters import flat_parameters
 from .filter_steps import FilterSteps, Step, filter_steps
@@ -72,6 +73,7 @@ class OnlineState:
     t0: float
     resets: Array
     is_on_grid: bool
+    clock: Clock = Clock()
 
 
 class OnlineFilter:
@@ -98,7 +100,7 @@ class OnlineFilter:
         return OnlineState(
             self._start.identity, self._theta, self._seeds, self._log_weights, self._points.left,
             self._steps.step, self._steps.time, self._start.t0, self._steps.resets,
-            self._steps.is_on_grid,
+            self._steps.is_on_grid, self._start.clock,
         )  # fmt: skip
 
     def update(
@@ -106,7 +108,7 @@ class OnlineFilter:
         observed: Any,
         *,
         step: int | None = None,
-        time: float | None = None,
+        time: Any = None,
         inputs: Any = None,
     ) -> Row:
         """Take a row of observations.
@@ -115,11 +117,12 @@ class OnlineFilter:
         ----------
         observed : float or array_like, shape (p,)
             NaN marks a missing component; a Series is aligned with ``observables`` by its index.
+            Of a row that is all NaN the log-likelihood is 0.
         step : int
             The row's step, later than that of the row before. Or give `time`.
-        time : float
+        time : float or date
             The row's time. Off the grid ``t0 + k * dt`` the gap is divided into the fewest equal
-            steps of at most ``dt``, as by `log_likelihood`.
+            steps of at most ``dt``, as by `log_likelihood`. A date where ``t0`` is one.
         inputs : array_like, optional
             A row for each step since the last row of observations, or one for all of them; one more
             if the observation has the argument u.
@@ -131,8 +134,8 @@ class OnlineFilter:
         Raises
         ------
         ModelError
-            If the row is not later than the last one, has no number, or has a density of zero. The
-            filter then stands where it was.
+            If the row is not later than the last one, or has a density of zero. The filter then
+            stands where it was.
         """
         datum = self._checked(observed)
         place, points, found = self._evaluated(datum, step, time, inputs)
@@ -147,7 +150,7 @@ class OnlineFilter:
         return Row(float(terms[0]), mean[0], cov[0], 1.0, float(n_particles[0]))
 
     def advance(
-        self, *, step: int | None = None, time: float | None = None, inputs: Any = None
+        self, *, step: int | None = None, time: Any = None, inputs: Any = None
     ) -> Prediction:
         """Stand at a later step or time without a row, as where an input changes.
 
@@ -160,9 +163,16 @@ class OnlineFilter:
         return prediction
 
     def _evaluated(
-        self, datum: Array, step: int | None, time: float | None, inputs: Any
+        self, datum: Array, step: int | None, time: Any, inputs: Any
     ) -> tuple[Place, FilterSteps, Step]:
         """A row at all points, from where the filter stands."""
+        clock = self._start.clock
+        if time is not None and (clock.unit is not None or are_dates(time)):
+            if clock.unit is None:
+                raise ModelError(
+                    f"time must be a number, as t0 is, got {time!r}: give online t0 as a date, too"
+                )
+            time = float(clock.numbers("time", [time])[0])
         place, points = self._steps.place(step, time), self._points
         if place.is_on_grid != self._steps.is_on_grid:  # the first row off the grid
             points = self._points_from(points.left, place.is_on_grid)
@@ -198,7 +208,7 @@ class OnlineFilter:
         return total
 
     def predict(
-        self, *, step: int | None = None, time: float | None = None, inputs: Any = None
+        self, *, step: int | None = None, time: Any = None, inputs: Any = None
     ) -> Prediction:
         """The state at a later step or time, given the rows so far; arguments as of `update`."""
         missing = np.full(self._system.p, np.nan)
@@ -226,11 +236,6 @@ class OnlineFilter:
         numbers = datum.tolist()
         if any(map(math.isinf, numbers)):
             raise ModelError(f"observed must be finite, or NaN where it is missing, got {numbers}")
-        if all(map(math.isnan, numbers)):
-            raise ModelError(
-                "observed has no number: use advance where there is no row, or predict, which "
-                "leaves the filter where it is"
-            )
         return datum
 
 
@@ -240,7 +245,8 @@ def online(
     params: Mapping[str, Any],
     *,
     state: OnlineState | None = None,
-    t0: float | None = None,
+    t0: Any = None,
+    unit: Any = None,
     random_seed: int | np.random.Generator | None = None,
 ) -> OnlineFilter:
     """Make a filter that takes the rows of a record as they come.
@@ -255,9 +261,11 @@ def online(
         weights at the start, which follow the likelihood of the rows.
     state : OnlineState, optional
         The ``state`` of another online filter of this system, filter and parameters, to go on from.
-        It has its own ``t0`` and noise.
-    t0 : float, optional
+        It has its own ``t0``, ``unit`` and noise.
+    t0 : float or date, optional
         The time of step 0, where ``initial_mean`` and ``initial_cov`` hold. Default: 0.
+    unit : str or pandas.Timedelta, optional
+        Where times are dates, the duration of one unit of ``dt``, such as "D"; ``t0`` is a date.
     random_seed : int or numpy.random.Generator, optional
         Of the noise inside the filter.
 
@@ -271,7 +279,8 @@ def online(
     ------
     ModelError
         If the filter cannot treat the system or cannot go on from a state, parameters do not fit,
-        or the state is of another system, filter or parameters or comes with `t0` or `random_seed`.
+        or the state is of another system, filter or parameters or comes with `t0`, `unit` or
+        `random_seed`.
 
     Notes
     -----
@@ -316,16 +325,19 @@ def online(
             raise ModelError("state must be of the same system and filter, got one of another")
         if state.identity != identity:
             raise ModelError("state must be of the same parameters, got one of others")
-        for name, value in {"t0": t0, "random_seed": random_seed}.items():
+        own = {"t0": t0, "unit": unit, "random_seed": random_seed}
+        for name, value in own.items():
             if value is not None:
                 raise ModelError(f"{name} must be None with state, which has its own")
         return OnlineFilter(system, filter, state)
     rng = check_random_seed(random_seed)
     seeds = rng.integers(np.iinfo(np.int64).max, size=len(theta))
     weights = np.full(len(theta), -math.log(len(theta)))
-    t0, resets = check_finite("t0", 0.0 if t0 is None else t0), np.zeros(len(system.accumulators))
+    dates = [[t0]] if are_dates(t0) else None  # the first of them
+    clock, t0 = clock_and_start(dates, 0.0 if t0 is None else t0, unit, "t0 and times")
+    resets = np.zeros(len(system.accumulators))
     nothing = [np.empty(0)] * len(theta)
-    start = OnlineState(identity, theta, seeds, weights, nothing, -1, t0, t0, resets, True)
+    start = OnlineState(identity, theta, seeds, weights, nothing, -1, t0, t0, resets, True, clock)
     return OnlineFilter(system, filter, start)
 
 

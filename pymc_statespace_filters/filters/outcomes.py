@@ -67,8 +67,9 @@ class Failure(OutcomeCode):
         "the observation has no density wherever this filter has the state: its mean is infinite "
         "or NaN, its noise has variance zero, or a parameter of its distribution is outside its "
         "domain, such as a negative mean of a Poisson distribution",
-        "Write the observation so that it is defined at every state, for example with "
-        "pt.softplus(x[0]), which is positive and does not overflow",
+        "If a sensor has no noise, give it some; otherwise write the observation so that it is "
+        "defined at every state, for example with pt.softplus(x[0]), which is positive and does "
+        "not overflow",
     )
     INVALID_PROBABILITY = (
         12,

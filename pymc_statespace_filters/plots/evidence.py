@@ -10,7 +10,7 @@ from arviz_plots import PlotCollection
 from arviz_plots.visuals import line_x, scatter_x
 
 from ..errors import ModelError
-from ..evidence import Evidence
+from ..evidence import Evidence, compare_evidence
 from ..system.checks import shortened
 from .picture import Mark
 from .rows import OF_PROBABILITIES, decimals, ends, format_probability, picture_of_rows
@@ -22,7 +22,7 @@ OPEN = {"facecolor": "B0", "edgecolor": "C0", "width": 1.5}
 
 
 def plot_evidence(
-    idata_or_table: xr.DataTree | pd.DataFrame | Mapping[str, Evidence],
+    idata_or_table: xr.DataTree | pd.DataFrame | Mapping[str, Any],
     *,
     backend: str | None = None,
     **pc_kwargs: Any,
@@ -31,10 +31,10 @@ def plot_evidence(
 
     Parameters
     ----------
-    idata_or_table : pandas.DataFrame, xarray.DataTree or mapping of str to Evidence
-        The table of `compare_evidence` (one row per model), the result of `estimate_evidence`, or
-        a DataTree with the group ``evidence`` (one row per estimator). An estimate without standard
-        error has no bar.
+    idata_or_table : pandas.DataFrame, xarray.DataTree or mapping
+        The table of `compare_evidence` or what it takes (one row per model), the result of
+        `estimate_evidence`, or a DataTree with the group ``evidence`` (one row per estimator). An
+        estimate without standard error has no bar.
     backend : {"matplotlib", "plotly", "bokeh", "none"}, optional
         Default: ``arviz.rcParams["plot.backend"]``.
     **pc_kwargs
@@ -80,7 +80,7 @@ def plot_evidence(
     )
 
 
-def _table(given: xr.DataTree | pd.DataFrame | Mapping[str, Evidence]) -> xr.Dataset:
+def _table(given: xr.DataTree | pd.DataFrame | Mapping[str, Any]) -> xr.Dataset:
     """Return log_evidence and se along one dimension."""
     if isinstance(given, xr.DataTree) and "evidence" in given.children:
         return given["evidence"].to_dataset()[["log_evidence", "se"]]
@@ -92,6 +92,8 @@ def _table(given: xr.DataTree | pd.DataFrame | Mapping[str, Evidence]) -> xr.Dat
         }
         if of_evidence and len(of_evidence) == len(given):
             given = pd.DataFrame.from_dict(of_evidence, orient="index").rename_axis("estimator")
+        elif given and all(isinstance(one, Evidence | Mapping) for one in given.values()):
+            given = compare_evidence(given)
     if isinstance(given, pd.DataFrame) and {"log_evidence", "se"} <= set(given.columns):
         named = given.rename_axis(given.index.name or "model")
         return named[["log_evidence", "se"]].to_xarray()

@@ -151,14 +151,17 @@ def are_dates(times: Any) -> bool:
 
 
 def times_of_data(observed: Any) -> Any:
-    """The dates in the index of a table or in the first dimension of a DataArray; None if none."""
+    """The dates in the index of a table or along the first dimension of a DataArray, if any.
+
+    Those of `simulate` are a coordinate beside the dimension, which counts steps.
+    """
     index = getattr(observed, "index", None)
     if isinstance(index, pd.DatetimeIndex):
         return index
-    dims, coords = getattr(observed, "dims", ()), getattr(observed, "coords", {})
-    if dims and dims[0] in coords and are_dates(coords[dims[0]]):
-        return coords[dims[0]].values
-    return None
+    dims, coords = getattr(observed, "dims", ())[:1], getattr(observed, "coords", {})
+    along = [name for name in coords if coords[name].dims == dims and are_dates(coords[name])]
+    named = [name for name in along if name in dims] or along
+    return coords[named[0]].values if len(named) == 1 else None
 
 
 def has_zone(name: str, dates: Any) -> bool:

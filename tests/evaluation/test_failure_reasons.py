@@ -171,7 +171,7 @@ def test_another_filter_is_no_cure_of_an_observation_that_is_not_defined():
     )  # fmt: skip
     (text,), _ = failures(counts, psf.GuidedPF(100), {})
     assert text.endswith(
-        "Write the observation so that it is defined at every state, for example "
+        "write the observation so that it is defined at every state, for example "
         "with pt.softplus(x[0]), which is positive and does not overflow."
     )
     texts, terms = failures(counts, psf.BootstrapPF(20_000), {})

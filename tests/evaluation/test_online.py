@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pandas as pd
 import pytensor.tensor as pt
 import pytest
 from scipy.special import logsumexp
@@ -78,6 +79,39 @@ def test_rows_are_those_of_a_run_that_goes_on_row_by_row(filter):
         row, given = tracker.update(y, step=int(k)), {"steps": [k], "seed": seed, "state": run}
         run = psf.run_filter(ONE_STATE, filter, {"a": 0.9}, [y], **given)
         assert_same([row], run)
+
+
+@pytest.mark.parametrize("filter", [psf.EKF(), psf.BootstrapPF(256)], ids=repr)
+@pytest.mark.parametrize("a", [0.9, [0.9, 0.4]], ids=["point", "draws"])
+def test_a_row_without_numbers_is_a_row(filter, a):
+    """The law moves, the terms are those of a run, and weights stay."""
+    params, data = {"a": np.array(a)}, [0.3, np.nan, 1.1]
+    tracker = psf.online(ONE_STATE, filter, params, random_seed=3)
+    rows = [tracker.update(y, step=2 * k) for k, y in enumerate(data)]
+    assert rows[1].log_likelihood == pytest.approx(0.0, abs=1e-15)
+    assert rows[1].n_effective == pytest.approx(rows[0].n_effective)
+    if np.ndim(a) == 0:
+        run = run_of(ONE_STATE, filter, params, data, tracker, steps=[0, 2, 4])
+        assert_same(rows, run)
+
+
+def test_times_may_be_dates():
+    dates = pd.Timestamp("2024-02-28") + pd.to_timedelta(STEPS, unit="D")
+    given = {"t0": pd.Timestamp("2024-02-28"), "unit": pd.Timedelta(days=10)}
+    tracker, state = psf.online(OSCILLATOR, psf.EKF(), PARAMS, **given), None
+    rows = []
+    for date, y in zip(dates, DATA, strict=True):
+        tracker = psf.online(OSCILLATOR, psf.EKF(), PARAMS, state=state) if state else tracker
+        rows.append(tracker.update(y, time=date))
+        state = pickle.loads(pickle.dumps(tracker.state))
+    terms = psf.log_likelihood(OSCILLATOR, psf.EKF(), PARAMS, DATA, times=STEPS * 0.1)
+    np.testing.assert_array_equal([row.log_likelihood for row in rows], terms)
+    with pytest.raises(ModelError, match="time must be dates"):
+        tracker.predict(time=9.0)
+    with pytest.raises(ModelError, match="as t0 is, got Timestamp.*: give online t0 as a date"):
+        psf.online(OSCILLATOR, psf.EKF(), PARAMS).predict(time=dates[0])
+    with pytest.raises(ModelError, match="unit must be None where t0 and times are not dates"):
+        psf.online(OSCILLATOR, psf.EKF(), PARAMS, unit="D")
 
 
 @pytest.mark.parametrize("times", [STEPS * 0.1, np.array([0.0, 0.1, 0.234, 0.5, 0.9, 1.05])])

@@ -47,6 +47,16 @@ def test_numbers_beside_the_points(table, estimates):
     assert drawn(collection, "one_se")["bridge"] is not None
 
 
+def test_what_compare_evidence_takes_is_compared(estimates):
+    given = {"one": {"bridge": estimates["bridge"]}, "two": {"bridge": estimates["bridge"]}}
+    points, expected = (
+        drawn(plot_evidence(models, backend="none"), "point")
+        for models in (given, compare_evidence(given))
+    )
+    assert set(points) == {"one", "two"}
+    assert points["one"]["x"] == expected["one"]["x"]
+
+
 def test_estimators_from_a_group(estimates):
     idata = xr.DataTree()
     for evidence in estimates.values():

@@ -365,6 +365,11 @@ def test_records_of_a_panel_start_at_their_own_first_dates():
     np.testing.assert_allclose(found, np.concatenate(parts), rtol=0, atol=1e-12)
     sim = psf.simulate(EXACT, THETA, times=dates, random_seed=1, **settings)
     np.testing.assert_array_equal(sim["obs_time"], dates)
+    given = {"observed": sim["observations"], **settings}  # brings its dates
+    by_dates, by_times = (
+        psf.log_likelihood(EXACT, psf.EKF(), THETA, times=times, **given) for times in (None, dates)
+    )
+    np.testing.assert_array_equal(by_dates, by_times)
 
 
 @pytest.mark.parametrize(
