@@ -73,7 +73,7 @@ class OnlineState:
     t0: float
     resets: Array
     is_on_grid: bool
-    clock: Clock = Clock()
+    clock: Clock
 
 
 class OnlineFilter:

@@ -32,7 +32,7 @@ from scipy.stats import rankdata
 from ..errors import ModelError
 from ..pymc_model.density import RowFunction
 from ..pymc_model.elements import labels_of
-from ..pymc_model.posterior_draws import STEP_CHECK, STEP_NATS, are_populations
+from ..pymc_model.posterior_draws import STEP_CHECK, STEP_NATS
 from ..pymc_model.step_refinement import densities_by_halvings, step_stability
 from ..statistics.lower_chains import lower_chains
 from .observed_data import scalar_count
@@ -62,7 +62,7 @@ def check_convergence(posterior: Posterior, idata: xr.DataTree | None = None) ->
     which draws are missing is `ENOUGH_EFFECTIVE` over the smallest one, at least 2. More draws do
     not help where a chain stays far below another one. ``idata`` tells which sampler drew them.
     """
-    if are_populations(idata):
+    if posterior.population is not None:
         return
     from arviz_stats import ess, rhat  # loads much: see `importance`
 

@@ -105,7 +105,7 @@ def run_estimators(
         *(undeclared or sentences(parts)),
     )
     posterior = replace(posterior, shared_seed=(*entropy, crc32(SHARED.encode())))
-    if are_populations(idata):
+    if posterior.population is not None:
         posterior = replace(posterior, remedy="take the evidence that sample_smc has stored")
     with row_progress(exact or density.calls, enabled=progressbar) as announce:
         if exact is not None:

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import pytensor
 from pymc.model import Model
+from pytensor.gradient import DisconnectedInputError
 
 from ..pymc_model.inspection import gradient_obstacle, kinked_variable
 from ..pymc_model.stepped import stepped_variables
@@ -51,6 +52,8 @@ def why_no_nuts(model: Model) -> str:
 def _missing_gradient(model: Model) -> str:
     try:
         pytensor.grad(model.logp(), [model.rvs_to_values[rv] for rv in model.free_RVs])
-    except (NotImplementedError, TypeError, ValueError) as error:
-        return f"the model has no gradient ({type(error).__name__})"
+    except DisconnectedInputError:
+        return "the density has no gradient with respect to some parameter"
+    except (NotImplementedError, TypeError, ValueError):
+        return "an operation in the model has no gradient"
     return ""

@@ -185,6 +185,8 @@ def sample_named(
         tree = None if trees is None else trees[name]
         if continue_from is not None and tree is not None:
             tree = appended(continue_from, tree)
+            reason = continue_from.attrs.get("sampler_reason", choice.reason)
+            choice = choice._replace(reason=reason)
     if tree is not None:
         tree.attrs |= {"sampler": choice.sampler, "sampler_reason": choice.reason}
     return tree

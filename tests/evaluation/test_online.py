@@ -108,7 +108,7 @@ def test_times_may_be_dates():
     np.testing.assert_array_equal([row.log_likelihood for row in rows], terms)
     with pytest.raises(ModelError, match="time must be dates"):
         tracker.predict(time=9.0)
-    with pytest.raises(ModelError, match="as t0 is, got Timestamp.*: give online t0 as a date"):
+    with pytest.raises(ModelError, match=r"as t0 is, got Timestamp.*: give online t0 as a date"):
         psf.online(OSCILLATOR, psf.EKF(), PARAMS).predict(time=dates[0])
     with pytest.raises(ModelError, match="unit must be None where t0 and times are not dates"):
         psf.online(OSCILLATOR, psf.EKF(), PARAMS, unit="D")

@@ -214,6 +214,11 @@ def test_the_choice():
     assert "no gradient" in choice.why_no_nuts(linear_model(3, psf.GridFilter()))
     assert sample(5, 0, model=linear_model(3), **QUIET).attrs["sampler"] == "dram"
     assert choice.why_dram(linear_model(3)) == ""
+    with pm.Model() as undetermined:
+        pm.Flat("a")
+    assert choice.why_no_nuts(undetermined) == (
+        "the density has no gradient with respect to some parameter"
+    )
     kinked = choice.why_dram(linear_model(200, kink=True))
     assert kinked == "the equations of 'd' have kinks or jumps"
 
@@ -233,6 +238,7 @@ def two_parts(request, tmp_path_factory):
     first.to_netcdf(path)
     read = xr.open_datatree(path).load()
     read.close()
+    read.attrs["sampler_reason"] = "as the race found"
     return whole, sample(40, continue_from=read, **call), read, call
 
 
@@ -242,6 +248,7 @@ def test_chains_go_on_with_the_bits_of_one_run(two_parts):
         xr.testing.assert_equal(both[group].to_dataset(), whole[group].to_dataset())
     assert both["sampler_state"].attrs == whole["sampler_state"].attrs
     assert both["posterior"].attrs["tuning_steps"] == 60
+    assert both.attrs["sampler_reason"] == "as the race found"
 
 
 def test_chains_that_cannot_go_on(two_parts):

@@ -35,7 +35,7 @@ class EvaluatedPoint(NamedTuple):
     log_screen: float = 0.0  # log-density of the screen, 0 without one
 
 
-class PriorDraws:
+class StartDraws:
     """Draws from the prior, as candidates for starts and as a measure of scale.
 
     PyMC does not pass ``initvals`` to a step method. The user's choice is recognised by a start
@@ -147,7 +147,7 @@ def best_initial_point(
 def chain_candidates(
     model: Model,
     raveled: RaveledVariables,
-    prior_draws: PriorDraws,
+    prior_draws: StartDraws,
     initvals: Any,
     seeds: Sequence[np.random.SeedSequence],
     *,

@@ -16,7 +16,7 @@ from ...pymc_model.inspection import (
     noisy_filters,
 )
 from ...pymc_model.unused_priors import warn_of_unused_priors
-from .initial_points import PriorDraws
+from .initial_points import StartDraws
 from .settings import RandomWalkSettings
 from .variables import RaveledVariables, check_noise_dependencies, continuous_value_vars
 
@@ -70,7 +70,7 @@ class SampledModel:
         self.raveled = RaveledVariables(variables, self._default)
         if not self.raveled.dim:
             raise ModelError("model must have at least one free variable to sample, got none")
-        self.prior_draws = PriorDraws(model, self.raveled, self._default)
+        self.prior_draws = StartDraws(model, self.raveled, self._default)
 
     @cached_property
     def noisy_filters(self) -> list[Any]:
