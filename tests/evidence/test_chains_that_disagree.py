@@ -1,6 +1,7 @@
 """The error of a mean where the chains disagree, and that of an evidence."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pymc as pm
@@ -68,10 +69,9 @@ def test_populations_of_particles_are_no_chains():
     draws = autoregressive((4, 100, 1), 0.5, np.random.default_rng(6))
     draws += np.array([0.0, 0.5, 1.0, 1.5])[:, np.newaxis, np.newaxis]
     posterior = Posterior(draws, norm.logpdf(draws[..., 0]), lambda x, rng: norm.logpdf(x[..., 0]))
-    of_chains, of_particles = xr.DataTree(), xr.DataTree()
-    of_particles.attrs["sampler"] = "smc"
-    assert "R-hat" in next(check_convergence(posterior, of_chains))
-    assert not list(check_convergence(posterior, of_particles))
+    population = np.broadcast_to(np.arange(4)[:, np.newaxis], (4, 100))
+    assert "R-hat" in next(check_convergence(posterior))
+    assert not list(check_convergence(replace(posterior, population=population)))
 
 
 @pytest.mark.parametrize("estimator", [ChibJeliazkov(), Bridge()])
