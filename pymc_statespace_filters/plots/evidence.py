@@ -93,7 +93,8 @@ def _table(given: xr.DataTree | pd.DataFrame | Mapping[str, Any]) -> xr.Dataset:
         if of_evidence and len(of_evidence) == len(given):
             given = pd.DataFrame.from_dict(of_evidence, orient="index").rename_axis("estimator")
         elif given and all(isinstance(one, Evidence | Mapping) for one in given.values()):
-            given = compare_evidence(dict(given))
+            models: dict[str, Any] = {name: given[name] for name in given}
+            given = compare_evidence(models)
     if isinstance(given, pd.DataFrame) and {"log_evidence", "se"} <= set(given.columns):
         named = given.rename_axis(given.index.name or "model")
         return named[["log_evidence", "se"]].to_xarray()
