@@ -95,17 +95,22 @@ def test_where_estimates_fail():
     )
 
 
-def exact_draws():
-    with model_of(psf.EKF()):
-        return psf.sample_dram(300, tune=500, chains=2, random_seed=1, progressbar=False)
+def exact_draws(n):
+    """Parameters of the exact posterior, n of the points of a fine grid."""
+    grid = np.meshgrid(np.linspace(0.0, 1.5, 151), np.linspace(0.02, 2.0, 100), indexing="ij")
+    params = {"phi": grid[0].ravel(), "spread": grid[1].ravel()}
+    log_p = psf.log_likelihood(LINEAR, psf.EKF(), params, DATA, steps=STEPS).sum(axis=-1)
+    log_p -= 0.5 * ((params["phi"] - 0.5) / 0.5) ** 2 + 0.5 * params["spread"] ** 2
+    p = np.exp(log_p - log_p.max())
+    chosen = np.random.default_rng(1).choice(p.size, n, p=p / p.sum())
+    return {name: values[chosen] for name, values in params.items()}
 
 
 def test_the_suggestion_is_in_the_target_at_exact_draws():
     """Fresh seeds at draws of the exact posterior; errors of a tenth."""
     table = psf.suggest_particles(model_of(psf.BootstrapPF(25)), random_seed=1, progressbar=False)
     row = table.loc["d"]
-    posterior = az.extract(exact_draws(), num_samples=10, random_seed=1)
-    points = zip(posterior["phi"].values, posterior["spread"].values, strict=True)
+    points = zip(*exact_draws(10).values(), strict=True)
     variances = [
         log_likelihoods(
             LINEAR,
