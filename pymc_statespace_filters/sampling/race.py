@@ -18,6 +18,7 @@ from functools import partial
 from pymc.model import Model
 from xarray import DataTree
 
+from ..errors import ModelError
 from ..facts import in_words, tell
 from ..parallel.signals import is_interrupted, unless_interrupted
 from .choice import DRAM, MOST_THIN, NUTS, Choice, why_not_after_all
@@ -95,7 +96,10 @@ def race(
         if asked.max_draws is not None:
             asked = asked._replace(max_draws=min(asked.max_draws, MOST_THIN[NUTS] * asked.draws))
         given = asked, quiet, name, runs[-1].positions, most / _GRADIENT
-        unless_interrupted(partial(sample_nuts, model, *given), None)
+        try:
+            unless_interrupted(partial(sample_nuts, model, *given), None)
+        except ModelError as error:  # the walk has draws
+            reason = str(error)
         if request.until_ess is not None:
             spent = sum(map(_evaluations, runs)) / (request.chains * request.draws)
             walk(_WALK, spent)

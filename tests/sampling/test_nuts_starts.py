@@ -108,6 +108,15 @@ def schools(*, centred):
     return model
 
 
+def test_nuts_that_cannot_start_leaves_the_draws_of_the_walk():
+    """The posterior, 1 / a for large a, is improper, and the points of the walk are far out."""
+    with pm.Model() as model:
+        pm.Normal("y", 0.0, pm.HalfFlat("a"), observed=[1.2])
+    tree = psf.sample(model=model, random_seed=1, progressbar=False)
+    assert tree["posterior"].sizes["draw"] == 1000
+    assert tree.attrs["sampler_reason"].startswith("NUTS could not start, as density and gradient")
+
+
 def test_a_funnel_ends_the_run_at_the_first_doubling_that_does_not_help(caplog):
     tree = psf.sample(250, tune=500, model=schools(centred=True), **CALL)
 

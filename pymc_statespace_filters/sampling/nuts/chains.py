@@ -3,7 +3,6 @@
 import time
 import warnings
 from collections.abc import Callable
-from contextlib import suppress
 from threading import Semaphore
 from typing import Any, NamedTuple
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from nutpie.compiled_pyfunc import from_pyfunc
 from xarray import DataTree
 
+from ...errors import ModelError
 from ...parallel.signals import interrupts_are_noted, takes_interrupt
 from ..output.chain_bars import ChainProgress
 from ..output.convergence import Convergence, convergence
@@ -178,9 +178,15 @@ def _followed(
 
 
 def _is_finished(sampler: Any) -> bool:
-    with suppress(TimeoutError):  # nutpie did not answer at once
+    try:
         return bool(sampler.is_finished)
-    return False
+    except TimeoutError:  # nutpie did not answer at once
+        return False
+    except RuntimeError as error:  # with the trace of its machine code
+        reason = str(error).partition("\n")[0]
+        raise ModelError(
+            f"NUTS could not start, as density and gradient are not finite where it tried: {reason}"
+        ) from None
 
 
 def _shown(chain: Any) -> dict[str, float]:
