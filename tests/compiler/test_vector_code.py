@@ -13,6 +13,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.codegen.function_types import Graph
 from pymc_statespace_filters.compiler.codegen.functions import member_function
 from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
+from pymc_statespace_filters.system import normal_below as below
 
 N = 61  # vectors, and a rest
 C = np.array([0.7, 0.3])
@@ -43,6 +44,9 @@ FUNCTIONS = {
     "truth values": lambda x, a: (x > a) * x + 1.0 * (x < 0),
     "rounding": lambda x, a: pt.floor(x) + pt.ceil(x / a) + pt.round(x) * pt.trunc(3 * x),
     "remainder": lambda x, a: x % a + x // a,
+    "below a limit": lambda x, a: pt.add(
+        *(f(a * x) for f in (below.log_probability, below.hazard, below.excess, below.variance))
+    ),
     "cubic": lambda x, a: psf.mechanics.cubic(x, a, 0.3),
     "freeplay": lambda x, a: psf.mechanics.freeplay(x, 2.0, a),
     "smooth freeplay": lambda x, a: psf.mechanics.freeplay(x, 2.0, a, width=0.2),
