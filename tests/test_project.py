@@ -108,6 +108,20 @@ def test_the_insides_of_numba_and_pytensor_are_met_in_the_compiler_alone():
     assert outside == set()
 
 
+def test_no_end_of_chains_imports_jax():
+    """As these functions of SciPy do, where JAX is installed and ArviZ imported."""
+    found = {
+        f"{room}: {node.module}.{alias.name}"
+        for room in ("sampling", "checks", "smc", "statistics")
+        for file in (ROOT / psf.__name__ / room).rglob("*.py")
+        for node in nodes_of(file)
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+        if alias.name in {"logsumexp", "softmax", "log_softmax"}
+    }
+    assert found == set()
+
+
 def opened_without_encoding(file):
     """The lines of a file that read or write text in the encoding of the system."""
     for node in nodes_of(file):
