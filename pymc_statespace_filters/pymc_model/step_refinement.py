@@ -113,7 +113,7 @@ def step_stability(model: pm.Model) -> Callable[[Array], NDArray[np.bool_]] | No
     """Whether the steps of all integrators in a model are stable along the path without noise.
 
     The returned function takes points of the joined value variables, shape (m, k), and returns
-    booleans of shape (m,). None if no variable has an integrator.
+    booleans of shape (m,). None if no variable has an integrator whose steps have an error.
     """
 
     def is_stable(system: StateSpaceModel, *arguments: Array) -> NDArray[np.bool_]:
@@ -147,8 +147,11 @@ def step_accuracy(model: pm.Model) -> Callable[[Array], Array] | None:
 def _along_paths(
     model: pm.Model, examine: Callable[..., NDArray[Any]]
 ) -> Callable[[Array], NDArray[Any]] | None:
-    """What ``examine(system, theta, steps, inputs, t0)`` gives for every record, (m, records)."""
-    nodes = [n for n in likelihood_nodes([model.logp()]) if n.op.system.integrator is not None]
+    """What ``examine(system, theta, steps, inputs, t0)`` gives for every record, (m, records).
+
+    Of systems whose steps have an error; those of `ExactLinear` would be thousands of exponentials.
+    """
+    nodes = [n for n in likelihood_nodes([model.logp()]) if _has_error(n.op.system.integrator)]
     if not nodes:
         return None
     # theta, steps, inputs and t0, but not data and seed.
@@ -164,6 +167,11 @@ def _along_paths(
         return np.concatenate(found, axis=1)
 
     return along
+
+
+def _has_error(integrator: Any) -> bool:
+    """Whether there is an integrator, and its steps would change with their length."""
+    return integrator is not None and integrator.refined() is not integrator
 
 
 def _each_record(theta: Array, rows: Array, inputs: Array, t0: Array) -> list[Array]:

@@ -12,6 +12,7 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.pymc_model.step_refinement import (
     densities_by_halvings,
     path_eigenvalues,
+    step_accuracy,
     step_stability,
 )
 from pymc_statespace_filters.system.given_record import GivenRecord
@@ -128,6 +129,25 @@ def test_a_model_with_an_integrator_of_a_user_is_refined(runge_kutta):
         [model.rvs_to_values[a]], densities_by_halvings(model, 1), mode=AS_IT_STANDS
     )(-1.0)
     assert 0 < abs(coarse - fine) < 0.05
+
+
+def test_exact_steps_are_not_examined():
+    """They are as they are at any length; beside others the others alone count."""
+    exact = linear_by(psf.ExactLinear(lambda a: [[a]], [[0.3]], dt=0.1))
+    rough = linear_by(psf.EulerMaruyama(lambda x, a: [a * x[0]], [[0.3]], dt=0.1))
+
+    def examined(*systems):
+        with pm.Model() as model:
+            pm.Normal("a")
+            for i, system in enumerate(systems):
+                given = {"steps": [10, 20], "observed": [0.4, 0.2]}
+                psf.StateSpace(f"d{i}", system, psf.EKF(), **given)
+        return [function(model) for function in (step_stability, step_accuracy)]
+
+    assert examined(exact) == [None, None]
+    points = np.array([[-1.0], [-29.0]])
+    for both, alone in zip(examined(exact, rough), examined(rough), strict=True):
+        np.testing.assert_array_equal(both(points), alone(points))
 
 
 def test_an_incomplete_integrator_is_refused():
