@@ -149,8 +149,8 @@ class PFEnKF(ParticleFilter):
     the weight, or a covariance is singular or not finite) the update is that of the bootstrap
     filter.
 
-    With `observation_dist` or `observation_logp` observations are not simulated, no particle is
-    moved, and the filter is the bootstrap filter.
+    With `observation_dist`, `observation_logp` or censored data observations are not simulated, no
+    particle is moved, and the filter is the bootstrap filter.
 
     A particle with a non-finite state or simulated observation has weight zero. Carried states move
     with their particle, are not updated and are not part of the kernel densities.
