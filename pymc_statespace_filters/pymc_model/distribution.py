@@ -141,10 +141,10 @@ class StateSpace(Continuous):
     given the state. `EKF`, `UKF` and `IPLF` have the probability of the predicted law, and go on
     with the moments of the truncated law of state and observation (assumed-density filtering),
     which is approximate: where 10 to 70 % of 60 values of a linear system were censored, the error
-    had a standard deviation of 0.02 to 0.2 nats over records. Of several components of a row the measured ones come first, then the censored
-    ones in the order of columns. `EnKF`, ``observation_logp``, ``observation_dist`` in `IPLF`, and
-    sensors whose noise is correlated take no censored values. Predictions, simulations and
-    forecasts are of the values behind the limit.
+    had a standard deviation of 0.02 to 0.2 nats over records. Of several components of a row the
+    measured ones come first, then the censored ones in the order of columns. `EnKF`,
+    ``observation_logp``, ``observation_dist`` in `IPLF`, and sensors whose noise is correlated take
+    no censored values. Predictions, simulations and forecasts are of the values behind the limit.
 
     Examples
     --------
