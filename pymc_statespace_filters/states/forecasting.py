@@ -269,7 +269,7 @@ def _future_axis(
     events: Events | None,
 ) -> TimeAxis:
     """The axis of a record and its future, with the steps to predict."""
-    past, system = record.axis, record.variable.system
+    past, system, clock = record.axis, record.variable.system, record.variable.clock
     last, end = int(record.steps[-1]), float(past.times(record.steps[-1]))
     if sum(given is not None for given in (n_steps, steps, times)) != 1:
         raise ModelError("give exactly one of n_steps, steps and times")
@@ -281,7 +281,7 @@ def _future_axis(
         steps = check_steps(steps)
         numbers = end + system.dt * (steps - last)
     else:
-        numbers = record.variable.clock.numbers("times", times, record.number)
+        numbers = clock.numbers("times", times, record.number)
     if numbers.size == 0 or numbers[0] <= end + GRID_TOLERANCE * system.dt:
         name, at, got = "steps", f"step {last}", [] if steps is None else steps
         if steps is None:
@@ -295,18 +295,19 @@ def _future_axis(
     changes = changes[(changes > end) & (changes < numbers[-1])]
     when = NO_EVENTS if events is None else events.at
     if system.is_at_any_times:
-        return with_events(past.followed_by(numbers, changes, when), events)
+        return with_events(past.followed_by(numbers, changes, when), events, clock, record.number)
     given = TimesBetween(None, numbers, record.t0, changes, when)
     if is_grid([given], system.dt):
-        return with_events(axis_of(given, system.dt, on_grid=True), events)
-    check_takes(system, given, record.variable.clock, record.number)
+        on_grid = axis_of(given, system.dt, on_grid=True)
+        return with_events(on_grid, events, clock, record.number)
+    check_takes(system, given, clock, record.number)
     if system.n_inputs:
         raise ModelError(
             f"{record.prefix}times to predict, and changes of the inputs, must lie on the grid of "
             f"steps of a model with inputs whose record does, t0 = {record.t0:g} and dt = "
             f"{system.dt:g}, got times {record.shown(numbers)}"
         )
-    return with_events(past.followed_by(numbers, changes, when), events)
+    return with_events(past.followed_by(numbers, changes, when), events, clock, record.number)
 
 
 def _simulate(

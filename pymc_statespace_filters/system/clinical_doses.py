@@ -58,8 +58,10 @@ def events_of(doses: Sequence[Dose], labels: Sequence[Any]) -> dict[Any, pd.Data
     tables = {}
     for label, own in zip(labels, by_record, strict=True):
         amounts: dict[tuple[float, bool], dict[str, float]] = {}
-        for dose in own:
-            at = amounts.setdefault((dose.time, not dose.before), dict.fromkeys(columns, 0.0))
+        time = -np.inf
+        for dose in sorted(own, key=lambda dose: dose.time):
+            time = time if dose.time - time <= _ONE_TIME * abs(dose.time) else dose.time
+            at = amounts.setdefault((time, not dose.before), dict.fromkeys(columns, 0.0))
             at[dose.compartment] += dose.amount
         order = sorted(amounts)
         table = {"time": [time for time, _ in order], "before": [not after for _, after in order]}

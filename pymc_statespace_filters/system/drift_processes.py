@@ -5,6 +5,7 @@ from dataclasses import KW_ONLY, dataclass
 from typing import Any, ClassVar
 
 import pytensor.tensor as pt
+from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
 from .checks import check_count
@@ -123,5 +124,9 @@ class OrnsteinUhlenbeck(DriftProcess):
 
     def _step(self, length: Any, *values: TensorVariable) -> tuple[Any, TensorVariable]:
         strength, rate = values
-        spread = pt.sqrt(-pt.expm1(-2.0 * rate * length) / (2.0 * rate))
+        is_symbol = isinstance(length, Variable)
+        some = pt.switch(pt.gt(length, 0.0), length, 1.0) if is_symbol else length
+        spread = pt.sqrt(-pt.expm1(-2.0 * rate * some) / (2.0 * rate))
+        if is_symbol:  # the root has no derivative at the length zero
+            spread = pt.switch(pt.gt(length, 0.0), spread, 0.0)
         return pt.expm1(-rate * length), strength * spread

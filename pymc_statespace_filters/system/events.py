@@ -29,14 +29,21 @@ class Events:
     at: EventTimes
     values: np.ndarray
 
-    def columns(self, axis: TimeAxis) -> np.ndarray:
+    def columns(self, axis: TimeAxis, clock: Clock, record: int) -> np.ndarray:
         """For each step a one where it begins with an event, and the numbers of that event.
 
         Of an axis of any lengths, the steps up to the last one; of a grid, also those of later
         events. Steps without an event have the numbers of the first one, at which the event's
-        expressions are defined.
+        expressions are defined. Raise if two events begin one step.
         """
         steps, inside = axis.steps_of(self.at)
+        if (rows := np.flatnonzero(np.diff(steps[inside]) == 0)).size:
+            row = int(rows[0])
+            first, second = clock.shown(self.at.times[inside][row : row + 2], record)
+            raise ModelError(
+                f"events must be a millionth of a step apart, got {first} followed by {second}, "
+                f"with no observation between them: merge them into one row"
+            )
         n_rows = int(axis.steps[-1]) + 1
         if axis.starts is None and steps.size:
             n_rows = max(n_rows, int(steps.max()) + 1)
@@ -56,9 +63,11 @@ class Events:
         return Events(at, np.concatenate([self.values[own], later.values[new]]))
 
 
-def with_events(axis: TimeAxis, events: Events | None) -> TimeAxis:
+def with_events(axis: TimeAxis, events: Events | None, clock: Clock, record: int = 0) -> TimeAxis:
     """The axis with the columns of the events of its record."""
-    return axis if events is None else axis._replace(columns=events.columns(axis))
+    if events is None:
+        return axis
+    return axis._replace(columns=events.columns(axis, clock, record))
 
 
 def read_events(

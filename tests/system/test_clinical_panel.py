@@ -105,6 +105,13 @@ def test_a_row_and_an_additional_dose_at_one_time_are_both_given():
     assert found == [(0, 0, 5), (8, 1, 3), (8, 0, 5)]
 
 
+def test_additional_doses_that_meet_but_for_rounding_are_one_event():
+    rows = [(0, 10, 8, 0.1, NAN), (0.1, 100, 7, 0.1, NAN), (0.95, 0, 0, 0, 1.0)]
+    found = events(*rows, columns="TIME AMT ADDL II DV")
+    assert 0.1 + 5 * 0.1 != 6 * 0.1
+    assert [amount for _, _, amount in found] == [10] + [110] * 8
+
+
 def test_a_steady_state_is_some_earlier_doses():
     rows = [(0, 5, 1, 8, 2, NAN), (0, 0, 0, 0, 0, 1.0)]
     columns = "TIME AMT SS II ADDL DV"

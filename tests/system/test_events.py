@@ -183,6 +183,20 @@ def test_gradients_through_events_are_differences():
         assert found[i] == pytest.approx((values[1] - values[0]) / 2e-5, rel=1e-6, abs=1e-6)
 
 
+def test_a_drift_that_returns_has_a_gradient_over_a_step_of_length_zero():
+    """The spread of no time is zero at any rate."""
+    system = psf.drifting(COMPARTMENT, F=psf.OrnsteinUhlenbeck())
+    params = PARAMS | {"F_strength": 0.3}
+    events = DOSES | {"before": [1, 0, 0]}
+    with pm.Model() as model:
+        pm.Flat("F_rate")
+        psf.StateSpace("y", system, psf.EKF(), params=params, times=TIMES, observed=DATA,
+                       events=events)  # fmt: skip
+    log_density, slope = model.compile_logp(), model.compile_dlogp()({"F_rate": np.array(0.8)})
+    sides = [log_density({"F_rate": np.array(at)}) for at in (0.8 - 1e-5, 0.8 + 1e-5)]
+    np.testing.assert_allclose(slope, (sides[1] - sides[0]) / 2e-5, rtol=1e-6)
+
+
 def test_a_panel_with_events_of_each_record_is_the_sum_of_its_records():
     one = record_of_two()
     other = record_of_two(events={"time": [], "dose": [], "rinse": []})
@@ -320,6 +334,8 @@ BAD = {
     "dates": (DOSES | {"time": pd.date_range("2020", periods=3)}, "must be numbers"),
     "out of order": (DOSES | {"time": [1.0, 3.0, 2.0]}, "3.0 followed by 2.0 in row 2"),
     "twice": (DOSES | {"time": [1.0, 2.0, 2.0]}, "merge those of one time"),
+    "nearly twice": (DOSES | {"time": [0.3, 0.1 * 3, 3.0]}, "a millionth of a step apart"),
+    "about nothing": (DOSES | {"time": [1.0, 1.77, 1.77], "before": [0, 1, 0]}, "merge them into"),
     "before the start": (DOSES | {"time": [-1.0, 2.0, 3.0]}, "before t0 = 0.0"),
     "a flag": (DOSES | {"before": [0, 2, 0]}, "must be 1 where.*got 2 in row 1"),
 }
