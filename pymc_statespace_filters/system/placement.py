@@ -168,9 +168,7 @@ def place_by(
         axes = check_each(lambda g, one: earlier.axis(one, system.dt, g), numbers, given)
     else:
         axes = check_each(lambda one: axis_of(one, system.dt, on_grid=is_on_grid), given)
-    axes = check_each(
-        lambda g, axis, own: with_events(axis, own, clock, g), numbers, axes, events
-    )
+    axes = check_each(lambda g, axis, own: with_events(axis, own, clock, g), numbers, axes, events)
     found = tuple(own for own in events if own is not None)
     if timed is None:
         return Placement(system, clock, axes, timing.inputs, (), found)
