@@ -5,6 +5,7 @@ import pandas as pd
 import pymc as pm
 import pytensor.tensor as pt
 import pytest
+import xarray as xr
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.pymc_model.step_refinement import step_stability
@@ -320,6 +321,26 @@ def test_predictive_draws_and_states_have_the_events(fitted):
     states = psf.filtered_states(idata, model, progressbar=False, random_seed=1)
     found = states["filtered_states"]["y_mean"][0, 0, :, 0]
     np.testing.assert_allclose(found, amounts(TIMES), rtol=1e-6)  # at 1.0 before the dose there
+
+
+def test_smoothed_particles_pass_an_event_before_an_observation():
+    """Each path jumps by the dose alone, and the paths have the mean of an exact smoother."""
+    given = {"times": TIMES, "events": DOSES | {"before": [1, 0, 0]}}
+    given["observed"] = amounts(TIMES, before=(1.0,))[:, None] / VOLUME
+    with pm.Model() as model:
+        k = pm.Normal("k")
+        psf.StateSpace("y", COMPARTMENT, psf.EKF(), params=PARAMS | {"k": k}, **given)
+    idata = xr.DataTree.from_dict(
+        {"posterior": xr.Dataset({"k": (("chain", "draw"), [[DECAY] * 50])})}
+    )
+    call = {"at": "steps", "random_seed": 1, "progressbar": False, "extend_inferencedata": False}
+    found = psf.smoothed_states(idata, model, filter=psf.BootstrapPF(2000), **call)
+    exact = psf.smoothed_states(idata, model, **call)["smoothed_states"]["y_mean"]
+    found = found["smoothed_states"]
+    paths, at_one = found["y_states"][0, :, :, 0].values, np.flatnonzero(found["y_time"] == 1.0)
+    jumps = paths[:, at_one[1]] - paths[:, at_one[0]]
+    np.testing.assert_allclose(jumps, SHARE * DOSES["dose"][0], rtol=1e-12)
+    np.testing.assert_allclose(found["y_mean"].mean("draw"), exact.mean("draw"), atol=0.01)
 
 
 BAD = {

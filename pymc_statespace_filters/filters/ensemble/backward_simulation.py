@@ -6,7 +6,7 @@ A state at step k is drawn among the particles there with weights
 
 where x_{k+1} is the state already drawn (Godsill, Doucet and West 2004). Resampling and Kalman
 updates do not matter: only the weighted particles of each step do. The process noise must be
-additive, g(x, q) = g(x, 0) + B(x) q, and reach every state.
+additive, g(x, q) = g(x, 0) + B(x) q, and reach every state, or none during a step of length zero.
 
 Particles are proposed in proportion to their weights w_i and accepted with the ratio of the normal
 density to its upper bound (Douc, Garivier, Moulines and Olsson 2011), which takes a few tries. If
@@ -36,6 +36,7 @@ from .weights import normalise
 
 PARTICLES_PER_PATH = 16
 _LEAST_PATHS = 16
+_ROUNDING = 1e-10  # of a state, relative to the largest of all particles
 _TRIES_PER_PARTICLE = 1 / 4  # a try costs about four times what a particle costs in a full sweep
 
 
@@ -143,6 +144,8 @@ def _kernels(system, k, t, X, w, noise, scratch, kernel):
             for a in range(n):
                 for b in range(n):
                     roots[i, a, b] += (scratch[a, i] - means[a, i]) * (scratch[b, i] - means[b, i])
+    if not roots.any():
+        _spread_over_rounding(means, roots)
     for i in range(N):
         log_constants[i] = -np.inf
         if w[i] > 0.0:
@@ -152,6 +155,19 @@ def _kernels(system, k, t, X, w, noise, scratch, kernel):
             for a in range(n):
                 log_constants[i] -= math.log(roots[i, a, a])
     return True
+
+
+@njit_internal
+def _spread_over_rounding(means, covs):
+    """Covariances of a step without noise, as one of length zero: a state is where it went."""
+    n, N = means.shape
+    for a in range(n):
+        highest = 0.0
+        for i in range(N):
+            highest = max(highest, abs(means[a, i]))
+        sd = _ROUNDING * highest if highest > 0.0 else 1.0
+        for i in range(N):
+            covs[i, a, a] = sd * sd
 
 
 @njit_internal
