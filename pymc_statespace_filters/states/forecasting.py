@@ -93,7 +93,8 @@ def forecast(
         and hold up to the first time of others.
     events : DataFrame or mapping of columns, optional
         Events after the last observation, as in `StateSpace`; by default the later ones of the
-        model.
+        model. One at its time, and not before it, replaces that of the model. Earlier ones are not
+        looked at.
 
     Returns
     -------
@@ -231,7 +232,8 @@ def _events(at_draws: VariableAtDraws, events: Any) -> list[Events | None]:
         system, clock = variable.system, variable.clock
         later = read_events(table, system, clock, record.t0, record.number)
         end = float(record.axis.times(record.steps[-1]))
-        found.append(earlier and later and earlier.followed_by(later, end))
+        tolerance = GRID_TOLERANCE * system.dt
+        found.append(earlier and later and earlier.followed_by(later, end, tolerance))
     return found
 
 

@@ -53,14 +53,23 @@ class Events:
         columns[steps[inside], 1:] = self.values[inside]
         return columns
 
-    def followed_by(self, later: "Events", end: float) -> "Events":
-        """These events up to the time ``end``, and the later ones after it."""
-        own, new = self.at.times <= end, later.at.times > end
+    def followed_by(self, later: "Events", end: float, tolerance: float) -> "Events":
+        """These events up to the observation at ``end``, and the later ones after it.
+
+        One at ``end`` itself, after the observation, is the later one if there are two.
+        """
+        now = later._follow(end, tolerance)
+        own = (self.at.times <= end + tolerance) & ~(now.any() & self._follow(end, tolerance))
+        new = now | (later.at.times > end + tolerance)
         at = EventTimes(
             np.concatenate([self.at.times[own], later.at.times[new]]),
             np.concatenate([self.at.before[own], later.at.before[new]]),
         )
         return Events(at, np.concatenate([self.values[own], later.values[new]]))
+
+    def _follow(self, end: float, tolerance: float) -> np.ndarray:
+        """Which events come at a time, after the observation there."""
+        return np.asarray((np.abs(self.at.times - end) <= tolerance) & ~self.at.before)
 
 
 def with_events(axis: TimeAxis, events: Events | None, clock: Clock, record: int = 0) -> TimeAxis:

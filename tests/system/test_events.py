@@ -300,6 +300,17 @@ def test_a_forecast_has_the_later_events_of_the_model_or_others(fitted, times):
     np.testing.assert_allclose(found[0, :, :, 0], np.tile(expected, (4, 1)), rtol=1e-3)
 
 
+@pytest.mark.parametrize("times", [[3.2, 3.5], [3.25, 3.4]])
+def test_a_forecast_has_an_event_at_the_last_observation(fitted, times):
+    model, idata = fitted
+    others = {"time": [1.0, 3.0, 3.3], "dose": [7.0, 6.0, 8.0]}
+    call = {"random_seed": 1, "progressbar": False, "extend_inferencedata": False}
+    found = psf.forecast(idata, model, times=times, events=others, **call)["predictions"]["y"]
+    later = {name: [*values, *others[name][1:]] for name, values in DOSES.items()}
+    expected = amounts(np.array(times), later) / VOLUME
+    np.testing.assert_allclose(found[0, :, :, 0], np.tile(expected, (4, 1)), rtol=1e-3)
+
+
 def test_a_free_run_has_the_events_of_the_model_or_others(fitted):
     model, idata = fitted
     call = {"random_seed": 1, "progressbar": False, "extend_inferencedata": False}
