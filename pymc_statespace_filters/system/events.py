@@ -116,10 +116,12 @@ def _columns(table: Any, names: tuple[str, ...]) -> dict[str, Any]:
             f"events must be a table with the columns {wanted} (a DataFrame, or a dict of "
             f"columns), empty for a record without events, got {shortened(table)}"
         )
+    if isinstance(table, pd.DataFrame) and table.index.name == TIME:
+        table = table.reset_index()
     found = {str(name): table[name] for name in table}
+    if all(np.size(column) == 0 for column in found.values()):
+        return {name: np.zeros(0) for name in wanted}
     missing = [name for name in wanted if name not in found]
-    if missing and found and TIME not in found and len(found[next(iter(found))]) == 0:
-        missing = []
     others = [name for name in found if name not in (*wanted, BEFORE)]
     if missing or others:
         raise ModelError(

@@ -63,6 +63,8 @@ class TimeAxis(NamedTuple):
         """
         if self.starts is None or self.lengths is None:
             exact = (events.times - self.t0) / self.dt
+            if exact.max(initial=0.0) > MOST_STEPS:
+                raise too_many_steps(float(exact.max()))
             return np.round(exact).astype("int64"), np.ones(exact.size, dtype=bool)
         tolerance = GRID_TOLERANCE * self.dt
         first = np.searchsorted(self.starts, events.times - tolerance, side="left")

@@ -132,6 +132,9 @@ def test_a_map_composes_an_event_with_its_next_step():
     with pytest.raises(psf.errors.ModelError, match=r"the event at 1\.5 is off the grid"):
         psf.simulate(system, {"a": 0.9}, steps=[2], inputs=inputs,
                      events={"time": [1.5], "share": [1]})  # fmt: skip
+    with pytest.raises(psf.errors.ModelError, match="steps must be at most 1e"):
+        psf.simulate(system, {"a": 0.9}, steps=[2], inputs=inputs,
+                     events={"time": [1e19], "share": [1]})  # fmt: skip
     with pytest.raises(psf.errors.ModelError, match="must not come before the observation"):
         psf.simulate(system, {"a": 0.9}, steps=[2], inputs=inputs,
                      events={"time": [2], "share": [1], "before": [1]})  # fmt: skip
@@ -213,9 +216,12 @@ def test_a_panel_with_events_of_each_record_is_the_sum_of_its_records():
     np.testing.assert_allclose(found, np.concatenate(alone), rtol=1e-13)
     shared = psf.log_likelihood(TWO, psf.EKF(), params, **both | {"events": one["events"]})
     np.testing.assert_allclose(shared, np.tile(alone[0], 2), rtol=1e-13)
-    in_order = both | {"events": [one["events"], {}]}
+    in_order = both | {"events": [pd.DataFrame(one["events"]).set_index("time"), {}]}
+    found = psf.log_likelihood(TWO, psf.EKF(), params, **in_order)
+    np.testing.assert_allclose(found, np.concatenate(alone), rtol=1e-13)
+    wrong = both | {"events": [one["events"], {"time": [1.0]}]}
     with pytest.raises(psf.errors.ModelError, match=r"record 'b'.*must have the columns"):
-        psf.log_likelihood(TWO, psf.EKF(), params, **in_order)
+        psf.log_likelihood(TWO, psf.EKF(), params, **wrong)
 
 
 @pytest.mark.parametrize("filter", [psf.EKF(), psf.BootstrapPF(64)])
