@@ -10,6 +10,7 @@ from ..errors import ModelError
 from .checks import shortened
 from .clock import are_dates
 from .panel_records import records_of
+from .signature import TIME
 from .steps import nearest_steps
 
 
@@ -23,6 +24,7 @@ def panel_from(
     t0: Any = 0.0,
     unit: Any = None,
     censored: str | Sequence[str] | None = None,
+    events: pd.DataFrame | None = None,
 ) -> dict[str, Any]:
     """Arguments of a panel from a table in long format, one row for each observation.
 
@@ -45,13 +47,16 @@ def panel_from(
         default a record with dates starts at its first row.
     censored : str or sequence of str, optional
         The column of the flags of each column of ``values``, see `StateSpace`.
+    events : pandas.DataFrame, optional
+        The events of all records, a row for each: the columns ``record`` and ``time``, and those of
+        the events of the system.
 
     Returns
     -------
     dict
         The arguments ``panel``, ``steps`` or ``times``, and ``observed`` (J, p) of `StateSpace`,
-        `log_likelihood` and `run_filter`, and ``t0``, ``unit`` and ``censored``. Records are in the
-        order of their first rows, the rows of each by time.
+        `log_likelihood` and `run_filter`, and ``t0``, ``unit``, ``censored`` and ``events``.
+        Records are in the order of their first rows, the rows of each by time.
 
     Raises
     ------
@@ -111,6 +116,8 @@ def panel_from(
     if len(columns) > 1:
         named = {name: pd.DataFrame(own, columns=columns) for name, own in tables.items()}
     records = records_of(labels)
+    if events is not None:
+        named["events"] = _events(events, record, time, records.labels, rounds=dt is not None)
     parts = [
         _times(frame, order[rows], times.iloc[order[rows]], label)
         for label, rows in zip(records.labels, records.slices(), strict=True)
@@ -129,6 +136,26 @@ def panel_from(
         **named,
         "t0": 0.0 if are_dates(t0) else t0,
     }
+
+
+def _events(
+    events: pd.DataFrame, record: str, time: str, labels: Sequence[Any], *, rounds: bool
+) -> dict[Any, pd.DataFrame]:
+    """The table of events of each record."""
+    if not isinstance(events, pd.DataFrame) or not {record, time} <= set(events.columns):
+        raise ModelError(
+            f"events must be a pandas.DataFrame with the columns {[record, time]} and the numbers "
+            f"of events, got {shortened(events)}"
+        )
+    if rounds and are_dates(events[time]):
+        raise ModelError("events with dates need times with dates: leave out dt")
+    if (unknown := ~events[record].isin(labels)).any():
+        row = events.index.tolist()[int(np.argmax(unknown))]
+        raise ModelError(
+            f"events must be of records of frame, got {events[record][row]!r} in row {row!r}"
+        )
+    by_time = events.sort_values(time, kind="stable").rename(columns={time: TIME})
+    return {label: by_time[by_time[record] == label].drop(columns=record) for label in labels}
 
 
 def _times(frame: pd.DataFrame, rows: np.ndarray, times: pd.Series, label: Any) -> pd.Series:

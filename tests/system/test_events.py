@@ -224,6 +224,23 @@ def test_a_panel_with_events_of_each_record_is_the_sum_of_its_records():
         psf.log_likelihood(TWO, psf.EKF(), params, **wrong)
 
 
+def test_tables_in_long_format_are_a_panel_with_events():
+    frame = pd.DataFrame({"who": ["b"] * 4 + ["a"] * 4, "at": [*TIMES] * 2, "y": [*DATA[:, 0]] * 2})
+    doses = pd.DataFrame({"who": "b", "at": DOSES["time"], "dose": DOSES["dose"]}).iloc[::-1]
+    columns = {"record": "who", "time": "at", "values": "y"}
+    panel = psf.panel_from(frame, events=doses, **columns)
+    found = psf.log_likelihood(COMPARTMENT, psf.EKF(), PARAMS, **panel)
+    alone = [
+        psf.log_likelihood(COMPARTMENT, psf.EKF(), PARAMS, DATA, times=TIMES, events=events)
+        for events in (DOSES, {})
+    ]
+    np.testing.assert_allclose(found, np.concatenate(alone), rtol=1e-13)
+    with pytest.raises(psf.errors.ModelError, match="got 'c' in row 2"):
+        psf.panel_from(frame, events=doses.assign(who=["c", "b", "b"]), **columns)
+    with pytest.raises(psf.errors.ModelError, match=r"with the columns \['who', 'at'\]"):
+        psf.panel_from(frame, events=DOSES, **columns)
+
+
 @pytest.mark.parametrize("filter", [psf.EKF(), psf.BootstrapPF(64)])
 @pytest.mark.parametrize("n_first", [1, 2, 3])
 def test_a_run_goes_on_across_events(filter, n_first):
