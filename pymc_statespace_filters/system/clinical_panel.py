@@ -97,7 +97,7 @@ def read_events(
 
     See Also
     --------
-    panel_from : A table without doses.
+    pymc_statespace_filters.panel_from : A table without doses.
 
     Examples
     --------
