@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..statistics.importance import normalised, student_factor, systematic
+from ..statistics.importance import log_sum, normalised, student_factor, systematic
 from .particles import Populations
 
 Array = NDArray[np.float64]
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 def merged_log_evidence(log_evidences: Array) -> tuple[Array, Array]:
     """Log of the mean of the evidences (R, ...), and its standard error from their spread."""
     count = len(log_evidences)
-    merged = np.logaddexp.reduce(log_evidences, axis=0) - math.log(count)
+    merged = log_sum(log_evidences, axis=0) - math.log(count)
     with np.errstate(invalid="ignore"):
         relative = np.exp(log_evidences - merged).std(axis=0, ddof=1)
     return np.asarray(merged), relative / math.sqrt(count) * student_factor(count)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ..statistics.importance import systematic
+from ..statistics.importance import log_sum, systematic
 
 Array = NDArray[np.float64]
 
@@ -85,7 +85,7 @@ class Populations(NamedTuple):
     @property
     def effective_sizes(self) -> Array:
         """Kish's effective sample size of each population, (R,)."""
-        return np.exp(-np.logaddexp.reduce(2 * self.log_weights, axis=1))
+        return np.exp(-log_sum(2 * self.log_weights, axis=1))
 
     @property
     def n_alive(self) -> NDArray[np.int64]:
@@ -109,7 +109,7 @@ class Populations(NamedTuple):
         alive = np.isfinite(increment)
         gain = np.where(alive, step * np.where(alive, increment, 0.0), -np.inf)
         log_weights = self.log_weights + gain
-        log_mean = np.logaddexp.reduce(log_weights, axis=1)
+        log_mean = log_sum(log_weights, axis=1)
         lost = np.isneginf(log_mean)
         log_weights -= np.where(lost, 0.0, log_mean)[:, np.newaxis]
         log_weights[lost] = self.log_weights[lost]

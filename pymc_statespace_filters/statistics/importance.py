@@ -42,10 +42,21 @@ class LogMean(NamedTuple):
         return count / (1 + count * self.error**2)
 
 
+def log_sum(log_terms: Array, axis: int | None = None) -> Array:
+    """Log of the sum of terms along an axis, or of all; those of -inf are zeros.
+
+    SciPy's logsumexp would import JAX, where it is installed, at every end of chains.
+    """
+    peak = np.max(log_terms, axis=axis, keepdims=True)
+    shift = np.where(np.isneginf(peak), 0.0, peak)
+    with np.errstate(divide="ignore"):
+        sums = shift + np.log(np.exp(log_terms - shift).sum(axis=axis, keepdims=True))
+    return np.asarray(sums.squeeze(axis))
+
+
 def log_mean(log_terms: Array) -> float:
     """Log of the mean of all terms, those of -inf included as zeros."""
-    peak = log_terms.max()
-    return float(peak + np.log(np.exp(log_terms - peak).mean())) if peak > -np.inf else -np.inf
+    return float(log_sum(log_terms)) - math.log(log_terms.size)
 
 
 def mcse(terms: Array, population: NDArray[np.int64] | None = None) -> float:
@@ -206,10 +217,6 @@ def bridge_constant(at_draws: Array, at_proposals: Array, log_odds: float) -> fl
     function and ``u = l - ln Z_a + log_odds``. ``log_odds`` is that of the numbers of draws and
     proposals; -inf may be among the ratios at the proposals.
     """
-
-    def log_mean(logs: Array) -> float:
-        # SciPy's logsumexp would import JAX, where it is installed, at every end of chains.
-        return float(np.logaddexp.reduce(logs, axis=None)) - math.log(logs.size)
 
     def excess(log_evidence: float) -> float:
         shift = log_odds - log_evidence

@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
+from .importance import normalised
+
 DEGREES_OF_FREEDOM = 5.0
 N_STEPS, MIN_STEP = 200, 1e-3  # EM iterations; smallest gain in nats per draw
 ROUNDING = 1e-10  # of the largest eigenvalue, the least one of a conditional scale matrix
@@ -83,7 +85,7 @@ class StudentMixture:
         left = scales[:, kept][:, :, kept] - gain @ scales[:, given][:, :, kept]
         there = replace(self, means=self.means[:, given], chols=np.linalg.cholesky(marginal))
         log_weights = there.log_joint(values[None])[:, 0]
-        weights = np.exp(log_weights - np.logaddexp.reduce(log_weights))
+        weights = normalised(log_weights)
         # The units of coordinates may differ by any factor, so each has a floor of its own.
         units = np.sqrt(np.diagonal(scales[:, kept][:, :, kept], axis1=1, axis2=2))[:, :, None]
         factors = units * _factors(left / units / np.swapaxes(units, 1, 2))
@@ -97,7 +99,7 @@ class StudentMixture:
         roots = np.swapaxes(self.chols, 1, 2) @ slope
         moves = np.einsum("jab,jb->ja", self.chols, roots)
         log_weights = np.log(self.weights) + self.means @ slope + 0.5 * (roots**2).sum(axis=1)
-        weights = np.exp(log_weights - np.logaddexp.reduce(log_weights))
+        weights = normalised(log_weights)
         return replace(self, weights=weights, means=self.means + moves)
 
     def with_wide_parts(self, parts: Mapping[float, float]) -> "StudentMixture":

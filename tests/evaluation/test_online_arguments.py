@@ -80,7 +80,6 @@ def test_a_copy_has_memory_of_its_own(copied):
         ({"observed": 0.1, "time": np.inf}, "time must be a finite number"),
         ({"observed": 0.1}, "exactly one of step and time"),
         ({"observed": np.inf, "step": 4}, "observed must be finite"),
-        ({"observed": np.nan, "step": 4}, "use advance where there is no row"),
         ({"observed": [0.1, 0.2], "step": 4}, "observed must have a number for each of"),
         ({"observed": 0.1, "step": 4, "inputs": [1.0]}, "inputs must be None"),
         ({"observed": 1e200, "step": 4}, "the row at step 4 has no likelihood"),

@@ -18,6 +18,8 @@ Journal of the Royal Statistical Society B 86, 1-27.
 import numpy as np
 from numpy.typing import NDArray
 
+from ...statistics.importance import log_sum
+
 Array = NDArray[np.float64]
 
 _SHARES = 2.0 ** -np.arange(6.0)
@@ -32,7 +34,7 @@ def log_e_values(log_ratios: Array) -> Array:
     with np.errstate(divide="ignore"):
         kept = np.log1p(-shares)
     money = np.logaddexp(kept, np.log(shares) + log_ratios).sum(axis=-1)
-    return np.asarray(np.logaddexp.reduce(money, axis=0) - np.log(len(_SHARES)))
+    return log_sum(money, axis=0) - np.log(len(_SHARES))
 
 
 def proved_shortfall(estimates: Array, bounds: Array, alpha: float) -> float:
@@ -56,7 +58,7 @@ def proved_shortfall(estimates: Array, bounds: Array, alpha: float) -> float:
     needed, low = np.log(len(bounds) / alpha), high - _FARTHEST
     for _ in range(_N_HALVINGS):  # the e-value falls with t, and is 1 at most at the highest ratio
         middle = 0.5 * (low + high)
-        if np.logaddexp.reduce(log_e_values(ratios - middle)) >= needed:
+        if log_sum(log_e_values(ratios - middle)) >= needed:
             low = middle
         else:
             high = middle
@@ -69,7 +71,7 @@ def visible_shortfall(estimates: Array, bounds: Array, alpha: float) -> float:
     Typical of the points: with estimates of the same scatter around a likelihood that is so far
     above the bounds. Infinite where the estimates lie below the bounds by their own collapse.
     """
-    centre = np.logaddexp.reduce(estimates, axis=1) - np.log(estimates.shape[1])
+    centre = log_sum(estimates, axis=1) - np.log(estimates.shape[1])
     if not np.isfinite(centre).any():
         return np.inf
     seen = np.isfinite(centre)

@@ -23,6 +23,7 @@ from ...filters.protocol import Filter
 from ...filters.rbpf import RBPF
 from ...pymc_model.filter_estimates import VariableAtPoints
 from ...pymc_model.inspection import resized
+from ...statistics.importance import log_sum
 from .budget import Budget
 
 Array = NDArray[np.float64]
@@ -48,7 +49,7 @@ class Estimates(NamedTuple):
     @property
     def mean(self) -> Array:
         """The log of the mean over seeds, (m,)."""
-        return np.asarray(np.logaddexp.reduce(self.logs, axis=1) - np.log(self.logs.shape[1]))
+        return np.asarray(log_sum(self.logs, axis=1) - np.log(self.logs.shape[1]))
 
     @property
     def error(self) -> Array:
