@@ -77,7 +77,9 @@ def race(
                 given = [_from_points(left(asked), runs)], quiet, (), runs[0].target
                 unless_interrupted(partial(sample_models, {name: model}, *given), None)
             needed = expected_iterations(first, runs[-1].length, runs[-1].convergence)
-            is_hopeless = needed > _UNKNOWN * most * request.draws
+            # Records find starts and proposals of their own, no better ones in a longer walk.
+            unknown = 1.0 if isinstance(runs[0].target, RecordTarget) else _UNKNOWN
+            is_hopeless = needed > unknown * most * request.draws
             if is_hopeless or asked.max_draws == limit or not _is_too_short(runs[-1]):
                 break
             thin *= _LONGER
