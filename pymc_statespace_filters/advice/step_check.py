@@ -7,7 +7,6 @@ compiled only where steps half as long are others.
 import numpy as np
 from numpy.typing import NDArray
 from pymc.model import Model
-from scipy.special import logsumexp, softmax
 from xarray import DataTree
 
 from ..errors import ModelError
@@ -15,6 +14,7 @@ from ..pymc_model.density import RowFunction
 from ..pymc_model.inspection import noisy_filters
 from ..pymc_model.posterior_draws import STEP_NATS, unconstrained_draws
 from ..pymc_model.step_refinement import densities_by_halvings, step_accuracy, step_lengths
+from ..statistics.importance import log_mean, normalised
 
 _N_POINTS, _N_DRAWS = 10, 200
 # Of the factors by which one step and two half as long multiply a deviation: that of Euler-Maruyama
@@ -80,11 +80,11 @@ def _changes(model: Model, x: Array) -> tuple[float, float]:
     if not (is_known & np.isfinite(fine)).any():
         return nothing
     change = (fine - coarse)[is_known]
-    weights, nats = softmax(change), logsumexp(change) - np.log(change.size)
+    weights, nats = normalised(change), log_mean(change)
     mean, spread = x[is_known].mean(axis=0), x[is_known].std(axis=0)
     varies = spread > _ROUNDING * np.abs(mean)
     moved = np.abs(weights @ x[is_known] - mean)[varies] / spread[varies]
-    return float(np.nan_to_num(moved).max(initial=0.0)), float(nats)
+    return float(np.nan_to_num(moved).max(initial=0.0)), nats
 
 
 def _some(draws: Array, count: int) -> Array:

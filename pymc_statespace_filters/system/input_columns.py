@@ -315,19 +315,21 @@ def inputs_of_user(system: "StateSpaceModel", rows: np.ndarray) -> np.ndarray:
 
 def columns_of_steps(system: "StateSpaceModel", rows: np.ndarray) -> np.ndarray | None:
     """The columns (rows, n) of a `TimeAxis` in rows of inputs (rows, n_input_columns)."""
-    if not system.n_step_columns:
-        return None
-    end = system.n_input_columns - len(system.accumulators)
-    return rows[:, end - system.n_step_columns : end]
+    return rows[:, _of_step(system)] if system.n_step_columns else None
 
 
 def without_events(system: "StateSpaceModel", rows: np.ndarray) -> np.ndarray:
     """Rows of inputs (..., n_input_columns) in which no step begins with an event."""
     rows = rows.copy()
     if system.events is not None:
-        end = system.n_input_columns - len(system.accumulators)
-        rows[..., end - system.n_step_columns] = 0.0
+        rows[..., _of_step(system).start] = 0.0
     return rows
+
+
+def _of_step(system: "StateSpaceModel") -> slice:
+    """Where the columns of a `TimeAxis` are in a row; with events, the first tells of one."""
+    end = system.n_input_columns - len(system.accumulators)
+    return slice(end - system.n_step_columns, end)
 
 
 def flags_at(system: "StateSpaceModel", rows: np.ndarray, steps: Any) -> np.ndarray:
@@ -361,10 +363,10 @@ def divided(system: "StateSpaceModel", rows: Any, factor: int) -> Any:
         columns[i] = columns[i] * is_last
     is_first = xp.eq(number, 0) if xp is pt else number == 0
     # A step, not each of its parts, begins with an event, and with sums that are zero again.
-    flags = [-i for i in range(1, len(system.accumulators) + 1)]
+    at_begin = [-i for i in range(1, len(system.accumulators) + 1)]
     if system.events is not None:
-        flags.append(first_move + len(system.held_for))
-    for i in flags:
+        at_begin.append(_of_step(system).start)
+    for i in at_begin:
         columns[i] = columns[i] * is_first
     return xp.stack(columns, axis=-1) if columns else repeated
 

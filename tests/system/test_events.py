@@ -8,6 +8,7 @@ import pytest
 import xarray as xr
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.compiler.lowering.compiled_system import compile_system
 from pymc_statespace_filters.pymc_model.step_refinement import step_stability
 from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.input_columns import divided
@@ -84,6 +85,7 @@ def test_a_grid_agrees_where_events_come_after_observations_and_refuses_others()
     call = {"times": TIMES, "params": PARAMS, "observed": DATA}
     found = psf.log_likelihood(COMPARTMENT, psf.GridFilter(), events=DOSES, **call)
     assert found.sum() == pytest.approx(log_density(), abs=1e-7)
+    assert psf.GridFilter().is_exact_for(compile_system(COMPARTMENT))  # an event is no kink
     events = pd.DataFrame(DOSES | {"before": [1, 0, 0]})
     with pytest.raises(psf.errors.ModelError, match="between an event and an observation"):
         psf.log_likelihood(COMPARTMENT, psf.GridFilter(), events=events, **call)
@@ -279,7 +281,7 @@ def test_an_event_is_of_one_part_of_a_divided_step_and_no_growth_of_a_step():
         psf.EulerMaruyama(lambda x, k: [-k * x[0]], lambda sigma: [[sigma]], dt=0.1),
         event=lambda x, factor: [factor * x[0]], events=["factor"],
     )  # fmt: skip
-    given = {"steps": [10, 20], "observed": [0.5, 0.4], "events": {"time": [1.0], "factor": [9.0]}}
+    given = {"steps": [10, 20], "observed": [0.5, 0.4], "events": {"time": [1.0], "factor": [-9.0]}}
     rows = read_record(system, GivenRecord(**given)).inputs
     np.testing.assert_array_equal(divided(system, rows, 3)[:, 0].nonzero()[0], [30])
     with pm.Model() as model:

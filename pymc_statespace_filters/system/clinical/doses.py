@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from .checks import check_count
-from .clinical_table import ClinicalTable, named
+from ..checks import check_count
+from .table import ClinicalTable, named
 
 # Times closer than this, relative to their size, are one: 0.1 * 3 is 0.3.
 _ONE_TIME = 1e-9

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ..errors import ModelError
-from .checks import is_finite, shortened
-from .clock import are_dates
-from .panel_records import Records, records_of
+from ...errors import ModelError
+from ..checks import is_finite, shortened
+from ..clock import are_dates
+from ..panel_records import Records, records_of
 
 _OF_A_DOSE = ("AMT", "RATE", "II", "ADDL", "SS")
 _NUMBERS = (*_OF_A_DOSE, "TIME", "DV", "EVID", "MDV", "CENS", "LIMIT")

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ..errors import INSIDE, ModelError, ModelWarning
-from .checks import check_finite
-from .clinical_doses import doses_of, events_of, inputs_of
-from .clinical_table import ClinicalTable, named, read_table
+from ...errors import INSIDE, ModelError, ModelWarning
+from ..checks import check_finite
+from .doses import doses_of, events_of, inputs_of
+from .table import ClinicalTable, named, read_table
 
 
 class ClinicalPanel(dict[str, Any]):
