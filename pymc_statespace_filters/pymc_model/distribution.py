@@ -105,8 +105,8 @@ class StateSpace(Continuous):
     censored : array_like, shape (J, p) or (J,), optional
         -1 where the true value lies below the number in ``observed``, 1 where above, 0 elsewhere,
         as for a limit of detection; columns are aligned as those of ``observed``. Of a count, -1
-        means at most, and 1 at least the number. The model stores it for plots, as data
-        ``{name}_censored``. See Notes.
+        means at most, and 1 at least the number. Flags stay with their rows where the data are
+        replaced. The model stores them for plots alone, as data ``{name}_censored``. See Notes.
     seed : int
         Seed of the noise inside the filter; in a panel, the noise of each record depends on it and
         on the record's label. The model stores it as shared data ``{name}_seed``,
