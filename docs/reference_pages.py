@@ -101,6 +101,7 @@ GROUPS = {
         "chib_jeliazkov",
         "evidence.Evidence",
     ),
+    "Before the experiment": ("expected_information",),
     "Plots": (
         "plot_states",
         "plot_forecast",

@@ -1,4 +1,5 @@
 from . import compartments, errors, mechanics, pharmacometrics
+from .designs import expected_information
 from .diagnostics import (
     check_filter,
     compute_log_likelihood,
@@ -107,6 +108,7 @@ __all__ = [
     "drifting",
     "errors",
     "estimate_evidence",
+    "expected_information",
     "extend",
     "filter_diagnostics",
     "filtered_states",

@@ -29,10 +29,10 @@ _SEED_ADVICE = (
 def shared_by_ranks[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     """Let the ranks of a function's argument ``comm`` share the points that it evaluates.
 
-    The function has an argument ``model``, and of ``idata``, ``random_seed`` and ``progressbar``
-    those that it needs. All ranks make the call in step: those without draws get them from the
-    first rank, which alone shows bars, warns and logs. The result is None, beside its type, on
-    ranks that do not get it.
+    The function has an argument ``model``, or ``models``, one or a mapping, and of ``idata``,
+    ``random_seed`` and ``progressbar`` those that it needs. All ranks make the call in step: those
+    without draws get them from the first rank, which alone shows bars, warns and logs. The result
+    is None, beside its type, on ranks that do not get it.
 
     Raises
     ------
@@ -71,10 +71,17 @@ def _share_arguments(comm: Communicator, ranks: Ranks, given: BoundArguments) ->
     """Check that all ranks have the same arguments, and complete those of this one."""
     given.apply_defaults()
     values = given.arguments
-    values["model"] = given_model(values["model"])
+    if "models" in values:
+        models = values["models"]
+        built = list(models.values()) if isinstance(models, Mapping) else [models]
+    else:
+        built = [given_model(values["model"])]
+        values["model"] = built[0]
     settings = ranks.settings | {"random_seed": _comparable(values.get("random_seed"))}
     check_same_call(
-        comm, lambda: [settings, _identity(values["model"])], {"random_seed": _SEED_ADVICE}
+        comm,
+        lambda: [settings, *(_identity(given_model(one)) for one in built)],
+        {"random_seed": _SEED_ADVICE},
     )
     # What has a checkpoint goes on with the numbers of a run that had no seed either.
     if values.get("random_seed", 0) is None and "checkpoint" not in values:

@@ -40,7 +40,7 @@ def _undecided(table: pd.DataFrame, ci_prob: float) -> Iterator[str]:
         remedy = ""
     which = f"whether {best!r} or {rivals[0]!r} is more probable"
     if len(rivals) > 1:
-        which = f"which of {_names([best, *rivals])} is the most probable"
+        which = f"which of {quoted([best, *rivals])} is the most probable"
     yield f"Undecided at {100 * ci_prob:g} %: {which}{remedy}."
 
 
@@ -71,7 +71,7 @@ def _against_bic(table: pd.DataFrame, names: list[str]) -> str:
         excess = _penalty(row) - row["n_parameters"] / 2 * math.log(row["n_observations"])
         parts.append(f"{name!r} by {abs(excess):.1f} nats {'more' if excess > 0 else 'less'}")
     return (
-        f"the priors penalise {_joined(parts)} than BIC's k/2 ln J does; the wider a prior, the "
+        f"the priors penalise {joined(parts)} than BIC's k/2 ln J does; the wider a prior, the "
         "larger its penalty"
     )
 
@@ -83,7 +83,7 @@ def _against_aic(table: pd.DataFrame, names: list[str]) -> str:
     ]
     return (
         "AIC penalises each parameter by 1 nat, the priors penalise "
-        f"{_joined(parts)}; the wider a prior, the larger its penalty"
+        f"{joined(parts)}; the wider a prior, the larger its penalty"
     )
 
 
@@ -100,7 +100,7 @@ def _warnings(evidences: Mapping[str, Evidence]) -> Iterator[str]:
         if reasons:
             models.setdefault(f"({evidence.estimator}): {'; '.join(reasons)}", []).append(name)
     for text, names in models.items():
-        yield f"Warning for {_names(names)} {text.removesuffix('.')}."
+        yield f"Warning for {quoted(names)} {text.removesuffix('.')}."
 
 
 def _reasons(evidence: Evidence) -> Iterator[str]:
@@ -116,19 +116,25 @@ def _reasons(evidence: Evidence) -> Iterator[str]:
 
 def _approximate(evidences: Mapping[str, Evidence]) -> Iterator[str]:
     names = [name for name, evidence in evidences.items() if evidence.approximate]
+    yield from approximation(names, len(evidences))
+
+
+def approximation(names: Sequence[str], n_models: int) -> Iterator[str]:
+    """Yield whose likelihood is approximate, of models with these names among so many."""
     if not names:
         return
-    of_whom = "all models" if len(names) == len(evidences) > 1 else _names(names)
+    of_whom = "all models" if len(names) == n_models > 1 else quoted(names)
     yield (
         f"The likelihood of {of_whom} is a filter's approximation; se does not include its error."
     )
 
 
-def _names(names: Iterable[str]) -> str:
-    return _joined([repr(name) for name in names])
+def quoted(names: Iterable[str]) -> str:
+    """Names in quotes, joined."""
+    return joined([repr(name) for name in names])
 
 
-def _joined(parts: list[str]) -> str:
+def joined(parts: list[str]) -> str:
     """Join as in "a, b and c"."""
     *others, last = parts
     return f"{', '.join(others)} and {last}" if others else last

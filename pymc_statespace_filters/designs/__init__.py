@@ -1,0 +1,5 @@
+"""Experiments before they are made: what a record of each design is expected to say."""
+
+from .expected_information import expected_information
+
+__all__ = ["expected_information"]

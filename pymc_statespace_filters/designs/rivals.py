@@ -1,0 +1,153 @@
+"""Rival models as designs see them: one system, its filter, and independent draws of theta."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+from numpy.typing import NDArray
+
+from ..errors import DataMismatchError, ModelError
+from ..filters.protocol import Filter
+from ..filters.written import short_form
+from ..pymc_model.at_points import GraphsAtPoints
+from ..pymc_model.checked_model import checked_model
+from ..pymc_model.density import check_free_variables
+from ..pymc_model.inspection import exactness, state_space_nodes
+from ..pymc_model.posterior_draws import unconstrained_draws
+from ..pymc_model.prior import ModelPrior
+from ..pymc_model.random_variable import PanelRV
+from ..system.model import StateSpaceModel
+
+FEWEST = 20  # draws and records, of which a jackknife makes groups
+ALONE = "model"  # the name of a model that is given without one
+
+Array = NDArray[np.float64]
+
+
+class Rival(NamedTuple):
+    """A model: theta (n, k) at independent draws, thinned from ``n_given`` if they were given."""
+
+    system: StateSpaceModel
+    filter: Filter
+    theta: Array
+    n_given: int
+    is_exact: bool
+
+
+def named_models(models: Any) -> dict[str, pm.Model]:
+    """The models by name."""
+    found = dict(models) if isinstance(models, Mapping) else {ALONE: models}
+    if not found or not all(isinstance(one, pm.Model) for one in found.values()):
+        got = list(found.values()) or models
+        raise ModelError(f"models must be a pymc.Model, or a dict of them by name, got {got!r}")
+    return found
+
+
+def read_rivals(
+    models: Mapping[str, pm.Model], idata: Any, n_draws: int, rng: np.random.Generator
+) -> dict[str, Rival]:
+    """The models with draws of their priors, or of ``idata``, a DataTree or one for each model.
+
+    Raises
+    ------
+    ModelError
+        If a model has no repeatable likelihood of one record, or too few draws.
+    DataMismatchError
+        If draws are those of another model.
+    """
+    if idata is not None and not isinstance(idata, Mapping | xr.DataTree):
+        raise ModelError(f"idata must be a DataTree, or a dict of them by model, got {idata!r}")
+    if isinstance(idata, xr.DataTree) and len(models) == 1:
+        idata = dict.fromkeys(models, idata)
+    if idata is not None and (isinstance(idata, xr.DataTree) or set(idata) != set(models)):
+        got = "one DataTree" if isinstance(idata, xr.DataTree) else list(idata)
+        raise ModelError(f"idata must have draws of each of the models {list(models)}, got {got}")
+    found = {}
+    for name, model in models.items():
+        own = None if idata is None else idata[name]
+        try:
+            found[name] = _read(model, own, n_draws, rng)
+        except (ModelError, DataMismatchError) as error:
+            place = "models" if list(models) == [ALONE] else f"models[{name!r}]"
+            raise type(error)(f"{place}: {error}") from None
+    names = {name: one.system.observables for name, one in found.items()}
+    if len(set(names.values())) > 1:
+        raise ModelError(f"models must have the same observables in the same order, got {names}")
+    return found
+
+
+def _read(model: pm.Model, idata: Any, n_draws: int, rng: np.random.Generator) -> Rival:
+    nodes = state_space_nodes(model)
+    if len(nodes) != 1:
+        raise ModelError(f"a design needs a model with one StateSpace variable, got {list(nodes)}")
+    ((name, node),) = nodes.items()
+    system, filter = node.op.system, node.op.filter
+    if isinstance(node.op, PanelRV):
+        raise ModelError(
+            f"{name!r} must hold one record, got a panel: build the model of the new record alone, "
+            "with the parameters of the records as a prior"
+        )
+    if filter.noisy:
+        raise ModelError(
+            f"the filter of {name!r} must have the same likelihood at each call, got "
+            f"{short_form(filter)}, whose noise would count as information: use another one, such "
+            "as EKF, UKF, IPLF or GridFilter"
+        )
+    if system.is_censored:
+        raise ModelError(
+            f"{name!r} must have no censored values, as simulated records have none: build the "
+            "model without censored="
+        )
+    if node.op.score_from:
+        raise ModelError(
+            f"score_from of {name!r} must be 0, as a new record begins at the start, got "
+            f"{node.op.score_from}"
+        )
+    if node.outputs[1] not in model.observed_RVs:
+        rows = node.inputs[-4].shape[0].eval(mode="FAST_COMPILE")
+        model = pm.observe(model, {name: np.zeros((int(rows), system.p))})
+    if idata is not None:
+        model = checked_model(model, idata)
+    theta, n_given = _theta(model, name, idata, n_draws, rng)
+    return Rival(system, filter, np.ascontiguousarray(theta), n_given, exactness(model))
+
+
+def _theta(
+    model: pm.Model, name: str, idata: Any, n_draws: int, rng: np.random.Generator
+) -> tuple[Array, int]:
+    """Parameters of the variable at independent draws, and how many draws there were."""
+    graph = state_space_nodes(model)[name].inputs[-5]
+    if not model.free_RVs:
+        return np.tile(graph.eval(mode="FAST_COMPILE"), (n_draws, 1)), n_draws
+    check_free_variables(model)
+    if idata is not None:
+        x, n_given = _independent(unconstrained_draws(idata, model), n_draws, rng)
+    elif model.potentials:
+        raise ModelError(
+            f"draws of the prior leave out the potentials {[p.name for p in model.potentials]}: "
+            "give draws as idata="
+        )
+    else:
+        x, n_given = ModelPrior(model).sample(n_draws, rng), n_draws
+    return GraphsAtPoints(model, [graph])(x)[0], n_given
+
+
+def _independent(draws: Array, n_draws: int, rng: np.random.Generator) -> tuple[Array, int]:
+    """Draws (chain, draw, k), evenly thinned to no more than their effective number, shuffled."""
+    from arviz_stats.base import array_stats  # loads much: see `statistics.importance`
+
+    sizes = [
+        array_stats.ess(one, chain_axis=0, draw_axis=1, method="bulk")
+        for one in np.moveaxis(draws, -1, 0)
+    ]
+    below = np.concatenate(draws)
+    n_effective = int(min(np.min(sizes), len(below)))
+    if n_effective < FEWEST:
+        raise ModelError(
+            f"idata must have at least {FEWEST} independent draws, got {len(below)} draws that are "
+            f"worth {n_effective} (the smallest bulk effective sample size): sample longer"
+        )
+    chosen = np.linspace(0, len(below) - 1, min(n_draws, n_effective)).round().astype(int)
+    return below[rng.permutation(chosen)], len(below)

@@ -1,0 +1,328 @@
+"""The public function against closed forms, with one linear system whose input has a gain."""
+
+import arviz as az
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+import pytest
+
+import pymc_statespace_filters as psf
+from pymc_statespace_filters.designs.candidates import read_designs
+from pymc_statespace_filters.designs.rivals import read_rivals
+from pymc_statespace_filters.errors import DataMismatchError, ModelError, ModelWarning
+
+DECAY, NOISE, SENSORS = 0.8, 0.3, (0.5, 0.1)
+SYSTEM = psf.StateSpaceModel(
+    transition=lambda x, q, u, gain: [DECAY * x[0] + gain * u[0] + q[0]],
+    process_noise=[[NOISE]],
+    observation=lambda x: [x[0], x[0]],
+    observation_noise=np.diag(SENSORS),
+    initial_mean=[0.0],
+    initial_cov=[[1.0]],
+    inputs=["force"],
+    observables=["cheap", "dear"],
+)
+STEPS = np.arange(1, 9)
+PUSH, PULSE = np.ones(8), np.eye(8)[0]
+DESIGNS = {
+    "pushed": {"steps": STEPS, "inputs": PUSH},
+    "pushed, cheap": {"steps": STEPS, "inputs": PUSH, "sensors": ["cheap"]},
+    "pushed, dear": {"steps": STEPS, "inputs": PUSH, "sensors": ["dear"]},
+    "pulse": {"steps": STEPS, "inputs": PULSE},
+    "pulse, early": {"steps": [1, 2], "inputs": PULSE},
+    "pulse, late": {"steps": [7, 8], "inputs": PULSE},
+    "late": {"steps": [8], "inputs": PUSH},
+    "twice": {"steps": [4, 8], "inputs": PUSH},
+    "signs": {"steps": STEPS, "inputs": (-1.0) ** STEPS},
+    "weak": {"steps": STEPS, "inputs": 0.3 * PUSH, "sensors": ["cheap"]},
+}
+FEW = {"n_records": 40, "n_draws": 60, "random_seed": 1, "progressbar": False}
+
+
+def model(sd=1.0, gain=None, filter=psf.EKF(), **settings):  # noqa: B008
+    """The gain with a normal prior, or a number."""
+    settings = {"steps": [1], "inputs": [0.0]} | settings
+    with pm.Model() as built:
+        params = {"gain": pm.Normal("gain", 0, sd) if gain is None else gain}
+        psf.StateSpace("d", SYSTEM, filter, params=params, **settings)
+    return built
+
+
+def moments(design):
+    """Per unit of the gain the mean of a record, and its covariance given the gain."""
+    steps, force = np.asarray(design["steps"]), np.asarray(design["inputs"])
+    state, means = 0.0, {0: 0.0}
+    for k in range(steps[-1]):
+        state = DECAY * state + force[k]
+        means[k + 1] = state
+    late, early = np.maximum.outer(steps, steps), np.minimum.outer(steps, steps)
+    powers = DECAY ** (2 * early)
+    variance = powers + NOISE * (1 - powers) / (1 - DECAY**2)
+    cov = DECAY ** (late - early) * variance
+    chosen = [("cheap", "dear").index(name) for name in design.get("sensors", ["cheap", "dear"])]
+    ones = np.ones((len(chosen), len(chosen)))
+    mean = np.repeat([means[k] for k in steps], len(chosen))
+    noise = np.tile(np.take(SENSORS, chosen), len(steps))
+    return mean, np.kron(cov, ones) + np.diag(noise)
+
+
+def truth(design, sd=1.0):
+    mean, cov = moments(design)
+    return np.log1p(sd**2 * mean @ np.linalg.solve(cov, mean)) / 2
+
+
+@pytest.fixture(scope="module")
+def table():
+    return psf.expected_information(model(), DESIGNS, random_seed=1, progressbar=False)
+
+
+def test_bounds_bracket_the_closed_form(table):
+    for name, design in DESIGNS.items():
+        row, true = table.loc[name], truth(design)
+        assert row["low"] - 3 * row["low_se"] < true < row["high"] + 3 * row["high_se"], name
+        assert row["high"] - row["low"] < 0.1
+        exact = true - truth(DESIGNS[table.index[0]])
+        assert abs(row["diff"] - exact) < 3 * row["dse"] + 1e-12
+
+
+def test_the_best_design_is_first_and_the_display_says_what_is_not_told_apart(table):
+    assert table["information"].is_monotonic_decreasing
+    near = [n for n in table.index[1:] if table.loc[n, "diff"] + 2 * table.loc[n, "dse"] > 0]
+    assert near == ["pushed, dear", "twice", "pushed, cheap"]
+    assert table.sentences == (
+        "Ranked by the expected information about the parameters, in nats.",
+        "'pushed, dear', 'twice' and 'pushed, cheap' are not told apart from 'pushed' (a "
+        "difference below 2 dse): a larger n_records, or target_se, makes the errors smaller.",
+    )
+    assert repr(table).splitlines()[0].split() == [
+        "information", "low", "high", "se", "diff", "dse"
+    ]  # fmt: skip
+
+
+def test_threads_change_no_bit_and_neither_do_other_designs():
+    few = dict(list(DESIGNS.items())[3:5])
+    both = psf.expected_information(model(), few, cores=2, **FEW)
+    alone = psf.expected_information(model(), few, cores=1, **FEW)
+    assert both.equals(alone)
+    one = psf.expected_information(model(), {"pulse": DESIGNS["pulse"]}, **FEW)
+    assert one.loc["pulse", "low"] == both.loc["pulse", "low"]
+
+
+def test_designs_with_other_times_have_the_same_noise():
+    rivals = read_rivals({"a": model()}, None, 20, np.random.default_rng(1))
+    read = read_designs({name: DESIGNS[name] for name in ("pulse", "pulse, late")}, rivals)
+    whole, late = (
+        read[name][0].simulated(np.ones(1), np.random.default_rng(2))
+        for name in ("pulse", "pulse, late")
+    )
+    np.testing.assert_array_equal(whole[-2:], late)
+
+
+def test_the_record_of_a_design_does_not_end_at_the_data_that_the_model_has():
+    observed = model(steps=[1, 2], inputs=PUSH, observed=np.zeros((2, 2)))
+    own = {"pulse": DESIGNS["pulse"]}
+    found = psf.expected_information(observed, own, **FEW)
+    assert found.equals(psf.expected_information(model(), own, **FEW))
+
+
+def test_records_are_added_until_errors_are_as_wanted():
+    own = {"pulse": DESIGNS["pulse"]}
+    found = psf.expected_information(model(), own, **FEW, target_se=0.08)
+    assert found["se"].item() <= 0.08
+    assert found["n_records[model]"].item() in (80, 160, 320)
+    whole = psf.expected_information(
+        model(), own, **FEW | {"n_records": int(found["n_records[model]"].item())}
+    )
+    assert whole.equals(found)
+
+
+def test_models_without_parameters_are_compared_by_their_likelihoods():
+    """Each law is a Gaussian, whose divergence from the other is the expected log Bayes factor."""
+    rivals = {"none": model(gain=0.0), "one": model(gain=1.0)}
+    settings = FEW | {"n_records": 400, "n_draws": 20}
+    found = psf.expected_information(rivals, {"late": DESIGNS["late"]}, **settings)
+    mean, cov = moments(DESIGNS["late"])
+    exact = mean @ np.linalg.solve(cov, mean) / 2
+    for pair in ("none, one", "one, none"):
+        error = found[f"log_bf[{pair}]"].item() - exact
+        assert abs(error) < 3 * found[f"log_bf_se[{pair}]"].item()
+    assert found["parameters[one]"].item() == pytest.approx(0, abs=1e-12)
+    assert 0 < found["information"].item() < np.log(2)
+    assert found["low"].item() == pytest.approx(found["high"].item())
+
+
+def test_weights_of_models_are_those_before_the_record():
+    rivals = {"none": model(gain=0.0), "one": model(gain=1.0)}
+    prior = {"none": 1.0, "one": 3.0}
+    found = psf.expected_information(rivals, {"late": DESIGNS["late"]}, model_prior=prior, **FEW)
+    assert "certainty is 0.562" in found.sentences[0]
+    by_model = 0.25 * found["decided[none]"] + 0.75 * found["decided[one]"]
+    assert found["decided"].item() == pytest.approx(by_model.item())
+
+
+def draws(n=2000, sd=0.2, seed=1, correlation=0.95):
+    """Draws of a normal gain that are autocorrelated."""
+    rng = np.random.default_rng(seed)
+    found = rng.normal(size=(2, n))
+    for k in range(1, n):
+        found[:, k] *= np.sqrt(1 - correlation**2)
+        found[:, k] += correlation * found[:, k - 1]
+    return az.from_dict({"posterior": {"gain": sd * found}})
+
+
+def test_draws_of_a_posterior_take_the_place_of_the_prior():
+    own = {"pushed": DESIGNS["pushed"]}
+    found = psf.expected_information(model(), own, idata=draws(), random_seed=1, progressbar=False)
+    assert abs(found["information"].item() - truth(own["pushed"], 0.2)) < 3 * found["se"].item()
+    n = found["n_draws[model]"].item()
+    assert 50 < n < 200  # of 4000, with an autocorrelation time of 39
+    assert found.sentences[1] == (
+        f"{n} of 4000 draws are used, evenly thinned: at most as many as independent draws would "
+        "be worth the same."
+    )
+
+
+def test_information_near_the_number_of_draws_is_called_a_lower_bound():
+    wide = psf.expected_information(model(sd=1e3), {"pushed": DESIGNS["pushed"]}, **FEW)
+    assert wide["low"].item() < np.log(60) + 1e-9
+    assert wide.sentences[1] == (
+        "With 'pushed' the information about the parameters is near the log of the number of "
+        "draws, 4.1, above which it is not seen: there low is a lower bound, and the others are "
+        "not reliable; more n_draws would show more."
+    )
+
+
+def test_records_that_overflow_are_left_out_with_a_warning():
+    with pm.Model() as built:
+        z = pm.Normal("z")
+        gain = pt.switch(z > 1, np.float64(1e308), z)
+        psf.StateSpace("d", SYSTEM, psf.EKF(), params={"gain": gain}, steps=[1], inputs=[0.0])
+    said = (
+        r"^\d+ of 40 records of the model 'model' with the design 'twice' are left out, because "
+        r"they, or their likelihoods at the parameters that made them, are not finite: the numbers "
+        r"are about the others; narrow the priors$"
+    )
+    with pytest.warns(ModelWarning, match=said):
+        found = psf.expected_information(built, {"twice": DESIGNS["twice"]}, **FEW)
+    assert 20 <= found["n_records[model]"].item() < 40
+
+
+def test_an_approximate_filter_is_doubted():
+    system = psf.StateSpaceModel(
+        transition=lambda x, q, a: [pt.sin(a * x[0]) + q[0]],
+        process_noise=[[0.3]],
+        observation=lambda x: [x[0]],
+        observation_noise=[[0.5]],
+        initial_mean=[1.0],
+        initial_cov=[[0.1]],
+    )
+    with pm.Model() as built:
+        pm.Normal("a")
+        psf.StateSpace("d", system, psf.EKF(), steps=[1])
+    found = psf.expected_information(built, {"x": {"steps": [1, 2]}}, **FEW)
+    assert found.sentences[-1] == (
+        "The likelihood of 'model' is a filter's approximation; se does not include its error."
+    )
+
+
+def refused(what, error=ModelError, **arguments):
+    given = {"models": model(), "designs": {"x": {"steps": [1], "inputs": [1.0]}}} | FEW | arguments
+    with pytest.raises(error) as raised:
+        psf.expected_information(given.pop("models"), given.pop("designs"), **given)
+    assert str(raised.value) == what
+
+
+def test_a_design_that_no_model_takes():
+    refused(
+        "designs['x'] may have steps, times, inputs, input_times, inputs_at, t0, unit, events and "
+        "sensors, got ['step']",
+        designs={"x": {"step": [1]}},
+    )
+    refused(
+        "designs['x']: inputs must have a row per step and a column for each of ['force'], got "
+        "None",
+        designs={"x": {"steps": [1]}},
+    )
+    refused(
+        "designs['x'] for models['a']: inputs must have at least 3 rows, because the last "
+        "observation is at step 3 (row k holds during step k), got 1",
+        models={"a": model()},
+        designs={"x": {"steps": [3], "inputs": [1.0]}},
+    )
+    refused("designs must be a dict of designs by name, got {}", designs={})
+    refused("designs['x'] must be a dict of arguments, got [1]", designs={"x": [1]})
+
+
+def test_sensors_that_do_not_exist():
+    refused(
+        "designs['x']: sensors must be a list of some of the observables ['cheap', 'dear'], got "
+        "['speed']",
+        designs={"x": {"steps": [1], "inputs": [1.0], "sensors": ["speed"]}},
+    )
+
+
+def test_draws_of_another_model():
+    other = az.from_dict({"posterior": {"slope": np.zeros((2, 100))}})
+    refused(
+        "models: idata must have draws of ['gain'], free variables of the model, got ['slope']",
+        DataMismatchError,
+        idata=other,
+    )
+    refused(
+        "idata must have draws of each of the models ['a', 'b'], got one DataTree",
+        models={"a": model(), "b": model()},
+        idata=other,
+    )
+    refused("idata must have draws of each of the models ['model'], got ['a']", idata={"a": other})
+    refused(
+        "models: idata must have at least 20 independent draws, got 200 draws that are worth 14 "
+        "(the smallest bulk effective sample size): sample longer",
+        idata=draws(100),
+    )
+
+
+def test_models_of_which_no_record_is_one():
+    refused(
+        "models: the filter of 'd' must have the same likelihood at each call, got EnKF(50), whose "
+        "noise would count as information: use another one, such as EKF, UKF, IPLF or GridFilter",
+        models=model(filter=psf.EnKF(50)),
+    )
+    refused(
+        "models['a']: 'd' must hold one record, got a panel: build the model of the new record "
+        "alone, with the parameters of the records as a prior",
+        models={"a": model(panel=["A", "B"], steps=[1, 1])},
+    )
+    with pm.Model() as empty:
+        pm.Normal("gain")
+    refused("models: a design needs a model with one StateSpace variable, got []", models=empty)
+    refused("models must be a pymc.Model, or a dict of them by name, got [3]", models={"a": 3})
+    with model() as doubted:
+        pm.Potential("more", -(doubted["gain"] ** 2))
+    refused(
+        "models: draws of the prior leave out the potentials ['more']: give draws as idata=",
+        models=doubted,
+    )
+
+
+def test_models_that_do_not_compare():
+    other = psf.StateSpaceModel(
+        transition=lambda x, q, u, gain: [DECAY * x[0] + gain * u[0] + q[0]],
+        process_noise=[[NOISE]],
+        observation=lambda x: [x[0]],
+        observation_noise=[[0.1]],
+        initial_mean=[0.0],
+        initial_cov=[[1.0]],
+        inputs=["force"],
+    )
+    with pm.Model() as one_sensor:
+        pm.Normal("gain")
+        psf.StateSpace("d", other, psf.EKF(), steps=[1], inputs=[0.0])
+    refused(
+        "models must have the same observables in the same order, got {'a': ('cheap', 'dear'), "
+        "'b': ('y0',)}",
+        models={"a": model(), "b": one_sensor},
+    )
+
+
+def test_odds_below_one():
+    refused("odds must be at least 1, got 0.5", odds=0.5)
