@@ -101,7 +101,7 @@ GROUPS = {
         "chib_jeliazkov",
         "evidence.Evidence",
     ),
-    "Before the experiment": ("expected_information",),
+    "Before the experiment": ("expected_information", "identifiability"),
     "Plots": (
         "plot_states",
         "plot_forecast",

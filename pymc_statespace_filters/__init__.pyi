@@ -1,5 +1,5 @@
 from . import compartments, errors, mechanics, pharmacometrics
-from .designs import expected_information
+from .designs import expected_information, identifiability
 from .diagnostics import (
     check_filter,
     compute_log_likelihood,
@@ -115,6 +115,7 @@ __all__ = [
     "find_starts",
     "forecast",
     "free_run",
+    "identifiability",
     "leave_future_out",
     "log_likelihood",
     "maximum_likelihood",

@@ -3,6 +3,7 @@
 A score is the derivative of a term log p(d_j | d_1 .. d_{j-1}) by a parameter.
 """
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -11,12 +12,16 @@ from numpy.typing import NDArray
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import ancestors
 
+from ..compiler.lowering.compiled_system import compile_system
 from ..compiler.lowering.structure import parameters_after_start
 from ..errors import ModelError
+from ..facts import in_words
+from ..filters.protocol import Filter
 from ..filters.written import short_form
 from ..ops.base import evaluator
-from ..ops.likelihood import LogLikelihood
+from ..ops.likelihood import LogLikelihood, NoGradient
 from ..ops.signatures import PANEL
+from ..system.model import StateSpaceModel
 from ..system.panel_records import FIRST_INPUT, RECORD, STEP, records_of, rows_of_copies
 from ..system.parameters import element_names
 from .at_points import GraphsAtPoints
@@ -69,7 +74,7 @@ class ScoredVariable:
         check_free_variables(model)
         node = state_space_nodes(model)[name]
         self.name, self.system, self.filter = name, node.op.system, node.op.filter
-        _check_filter(name, self.filter)
+        _check_filter(name, self.system, self.filter)
         self.clock, self._op, self._scored = node.op.clock, node.op, scored_rows(node)
         record = model.replace_rvs_by_values(list(node.inputs[-4:-1]))
         _check_record(name, record, model.value_vars)
@@ -83,8 +88,13 @@ class ScoredVariable:
         self.observed = np.asarray(observed.eval(mode="FAST_COMPILE"), dtype=np.float64)
         self._evaluate = evaluator(LogLikelihood(self.system, self.filter, PANEL))
         self._theta = GraphsAtPoints(model, [node.inputs[-5]])
-        others = [v for v in [*model.basic_RVs, *model.potentials] if v.name != name]
-        self._others = RowFunction(model, model.logp(vars=others))
+        self._model = model
+
+    @cached_property
+    def _others(self) -> RowFunction:
+        model = self._model
+        others = [v for v in [*model.basic_RVs, *model.potentials] if v.name != self.name]
+        return RowFunction(model, model.logp(vars=others))
 
     @property
     def n_records(self) -> int:
@@ -158,11 +168,13 @@ class ScoredVariable:
         return np.moveaxis(difference, 1, -1) / (2 * STEP_OF_X)
 
 
-def _check_filter(name: str, filter: object) -> None:
-    if not getattr(filter, "has_gradient", False):
+def _check_filter(name: str, system: StateSpaceModel, filter: Filter) -> None:
+    if not filter.has_gradient:
+        remedy = in_words(NoGradient(compile_system(system)))
         raise ModelError(
-            f"the filter of {name!r} must be EKF, UKF or IPLF, whose terms are smooth in the "
-            f"parameters, got {short_form(filter)}: estimate and scan the model with one of these"
+            f"the filter of {name!r} must have a gradient, as its terms must be smooth in the "
+            f"parameters, got {short_form(filter)}: "
+            f"{remedy or 'no filter of the package has one for this system'}"
         )
 
 

@@ -297,7 +297,7 @@ def test_bad_arguments():
     with pytest.raises(ModelError, match="idata must be a DataTree"):
         drift_scan(1.0, model)
     noisy = driven_model(simulated(2), filter=psf.BootstrapPF(100))
-    with pytest.raises(ModelError, match=r"must be EKF, UKF or IPLF.*BootstrapPF\(100\)"):
+    with pytest.raises(ModelError, match=r"must have a gradient.*BootstrapPF\(100\).*EKF"):
         drift_scan(Point(), noisy)
 
 

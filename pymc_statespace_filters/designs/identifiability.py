@@ -1,0 +1,403 @@
+"""`identifiability`: what the records of a model's design can say about its parameters."""
+
+from collections.abc import Iterable
+from math import ceil
+from typing import Any, ClassVar, NamedTuple, Self
+
+import numpy as np
+import pandas as pd
+import pymc as pm
+import xarray as xr
+from numpy.typing import NDArray
+
+from ..compiler.native.compilation import COMPILATION
+from ..errors import ModelError
+from ..progress import row_progress
+from ..pymc_model.checked_model import checked_model
+from ..pymc_model.elements import Elements
+from ..pymc_model.inspection import given_model
+from ..pymc_model.posterior_draws import unconstrained_draws
+from ..pymc_model.prior import ModelPrior
+from ..system.checks import check_count, check_random_seed
+from ..tables import SentenceTable
+from .fisher_information import (
+    Coordinates,
+    Likelihood,
+    expected_posterior,
+    normal_covariance,
+    spread,
+    with_dummy_data,
+)
+from .full_posteriors import FullPosterior
+from .weak_directions import (
+    WEAK,
+    combination_label,
+    determined_combinations,
+    precision,
+    weak_directions,
+)
+
+N_PRIOR = 4000  # draws, for the covariance of the prior
+LEAST_ROWS, ROWS_OF_PARAMETER = 500, 50  # rows of all simulated records of a point
+LEAST_LEFT = 0.5  # share of the points that must have a likelihood
+N_FULL = 6  # full posteriors
+DIFFERENT = 1.25  # factor between two ratios from which a posterior is not normal
+NOTHING = 0.97  # ratio, from which a parameter is as uncertain as before
+
+Array = NDArray[np.float64]
+
+
+class Identifiability(SentenceTable):
+    """A DataFrame with a row for each parameter, and the weak directions.
+
+    Attributes
+    ----------
+    directions : pandas.DataFrame
+        A row for each direction in which half of the prior's sd or more remains, weakest first:
+        ``remains``, the share that does, and the part of each parameter in sds of its prior.
+    combinations : pandas.DataFrame
+        What is determined of parameters that are not determined alone: sd and ratio.
+    """
+
+    _metadata: ClassVar[list[str]] = ["sentences", "directions", "combinations"]
+    main_columns = ("ratio", "se", "q05", "q95", "coordinate", "prior_sd", "posterior_sd")
+
+    def __init__(
+        self,
+        data: Any = None,
+        *,
+        directions: pd.DataFrame,
+        combinations: pd.DataFrame,
+        **settings: Any,
+    ) -> None:
+        super().__init__(data, **settings)
+        self.directions, self.combinations = directions, combinations
+
+    def __copy__(self, deep: bool = False) -> Self:
+        return type(self)(
+            self.copy(deep),
+            directions=self.directions,
+            combinations=self.combinations,
+            sentences=self.sentences,
+        )
+
+    def _texts(self, name: str) -> list[str]:
+        if name == "coordinate":
+            return list(self[name])
+        return [f"{value:.2g}" if name.endswith("sd") else f"{value:.3f}" for value in self[name]]
+
+
+def identifiability(
+    model: pm.Model | None = None,
+    *,
+    idata: xr.DataTree | None = None,
+    var_names: str | Iterable[str] | None = None,
+    n_draws: int = 100,
+    n_records: int | None = None,
+    random_seed: Any = None,
+    progressbar: bool = True,
+) -> Identifiability:
+    r"""What a record of the model's design can say: the expected posterior beside the prior.
+
+    Before there are data, or at a fit. The records are those of the model's `StateSpace` variables,
+    with their times, inputs, events, missing values and panels; their data are not used.
+
+    Parameters
+    ----------
+    model : pymc.Model, optional
+        With `StateSpace` variables, observed or not, whose filters have a gradient. Default: the
+        model of the ``with`` block.
+    idata : xarray.DataTree, optional
+        Draws of the posterior. The points are then some of these, and the answer is about a fresh
+        record of this design, alone with the prior, if parameters are as they were found. Default:
+        draws of the prior.
+    var_names : str or sequence of str, optional
+        Free variables, or elements such as ``"k[2]"``, that get a row. The others are unknown, too.
+    n_draws : int
+        Points at which records are simulated, at least 2.
+    n_records : int, optional
+        Simulated records at each point. Default: so many that they have 500 rows, and 50 for each
+        parameter.
+    random_seed : int or numpy.random.Generator, optional
+    progressbar : bool
+
+    Returns
+    -------
+    Identifiability
+        A DataFrame with a row for each element of a free variable, named as by ArviZ, and below it
+        sentences about what is hardly determined. Columns:
+
+        ``ratio``
+            Mean over the points of the sd of the posterior over that of the prior.
+        ``se``
+            Its standard error over the points.
+        ``q05``, ``q95``
+            Quantiles of the ratio over the points.
+        ``coordinate``
+            What the sds are of: ``"log"``, the logarithm of a positive parameter, so that an sd of
+            0.02 is 2 %; ``"value"``, the parameter; or ``"unconstrained"``, of an element of a
+            variable that its transform shortens, such as a simplex.
+        ``prior_sd``, ``posterior_sd``
+            In this coordinate; of the posterior the mean.
+        ``full_ratio``
+            The ratio by full posteriors of a few records.
+
+        The attribute ``directions`` has the weak directions, and ``combinations`` what is
+        determined in them.
+
+    Raises
+    ------
+    ModelError
+        If an argument is invalid; if there is no `StateSpace` variable, one has censored data, or a
+        filter without gradient; if the prior is improper; or if simulated records have no
+        likelihood at most of the points.
+    DataMismatchError
+        If the draws belong to another model.
+
+    Notes
+    -----
+    At each point the covariance of the posterior is :math:`(F + S^{-1})^{-1}`, with the expected
+    Fisher information F of the record and the covariance S of the prior. F is the mean over
+    simulated records of the sum of products :math:`g_j g_j^T` of the scores of rows given the rows
+    before, which has the mean of the product of their sums with a smaller variance.
+
+    S has the correlations of normal scores of draws of the prior. An sd is half the width of the
+    central 68 % interval, which is that of a normal law, so that heavy tails do not count. A prior
+    whose width depends on another parameter, as in a hierarchical model, is taken as the normal law
+    of this covariance.
+
+    That the posterior is normal is compared with the full posteriors of six records, by importance
+    sampling; a sentence says where their ratio is another one.
+
+    A direction is weak if half of the prior's sd remains along it. Combinations of up to three weak
+    parameters are tried: powers up to two of positive ones, multiples up to two of others. Other
+    observed variables of the model, and potentials, are not used.
+
+    References
+    ----------
+    M. K. Transtrum, B. B. Machta and J. P. Sethna (2011). Geometry of nonlinear least squares with
+    applications to sloppy models and optimization. Physical Review E 83, 036701.
+
+    Examples
+    --------
+    A population far below its capacity K:
+
+    >>> import pymc as pm
+    >>> import pymc_statespace_filters as psf
+    >>> growth = psf.StateSpaceModel(
+    ...     psf.RungeKutta4(lambda x, r, K: [r * x[0] * (1 - x[0] / K)], dt=0.1),
+    ...     observation=lambda x: [x[0]],
+    ...     observation_noise=[[0.1]],
+    ...     initial_mean=[1.0],
+    ...     initial_cov=0.0,
+    ... )
+    >>> with pm.Model():
+    ...     r, K = pm.LogNormal("r", 0, 0.5), pm.LogNormal("K", 7, 1)
+    ...     psf.StateSpace("d", growth, psf.EKF(), times=[0.5, 1.0, 1.5, 2.0])
+    ...     found = psf.identifiability(random_seed=1, progressbar=False)
+    d
+    >>> bool(found["ratio"]["r"] < 0.2), bool(found["ratio"]["K"] > 0.8)
+    (True, True)
+    """
+    given = given_model(model)
+    n_draws = check_count("n_draws", n_draws, 2)
+    rng = check_random_seed(random_seed)
+    own = with_dummy_data(given)
+    elements = Elements.of(own)
+    chosen = _chosen(elements, var_names)
+    with COMPILATION:
+        prior = ModelPrior(own).sample(N_PRIOR, rng)
+        sd, coordinates = spread(prior), Coordinates(own)
+        likelihood = Likelihood(own, sd)
+        full = FullPosterior(own, likelihood, coordinates, sd)
+    x = prior[:n_draws] if idata is None else _posterior_points(given, own, idata, n_draws)
+    k = len(sd)
+    rows = max(LEAST_ROWS, ROWS_OF_PARAMETER * k)
+    n_records = (
+        ceil(rows / likelihood.n_rows)
+        if n_records is None
+        else check_count("n_records", n_records, 1)
+    )
+    cov, covs, kept = normal_covariance(coordinates(prior)), [], []
+    with row_progress(likelihood, enabled=progressbar) as announce:
+        announce("simulated records", len(x) * n_records)
+        for i, point in enumerate(x):
+            information = likelihood.information(point, n_records, rng)
+            if information is not None:
+                inverse = np.linalg.inv(coordinates.jacobian(point, sd))
+                covs.append(expected_posterior(cov, inverse.T @ information @ inverse))
+                kept.append(i)
+        if len(kept) < LEAST_LEFT * len(x):
+            raise ModelError(
+                "simulated records must have a likelihood by the filter at most points, got one at "
+                f"{len(kept)} of {len(x)}: give the model a prior with less mass where its "
+                "equations have no solution"
+            )
+        announce("full posteriors", N_FULL)
+        tried = range(min(N_FULL, len(kept)))
+        found = [full.spread(x[kept[i]], covs[i], rng) for i in tried]
+    passed = [i for i in tried if found[i] is not None]
+    full_sds = np.array([found[i] for i in passed]).reshape(-1, k)
+    expected = Expected(list(elements.labels), coordinates.kinds, cov, np.array(covs))
+    ratios = full_sds / np.sqrt(np.diagonal(cov))
+    left_out = len(x) - len(kept)
+    return _table(expected, chosen, ratios, passed, len(tried), left_out, idata is not None)
+
+
+class Expected(NamedTuple):
+    """The prior's covariance (k, k), and those of posteriors (m, k, k), in the coordinates."""
+
+    labels: list[str]
+    kinds: NDArray[np.str_]
+    prior: Array
+    covs: Array
+
+    @property
+    def sds(self) -> Array:
+        """Of the posteriors (m, k)."""
+        return np.sqrt(np.diagonal(self.covs, axis1=1, axis2=2))
+
+    @property
+    def ratios(self) -> Array:
+        """Sds of the posteriors over those of the prior (m, k)."""
+        return np.asarray(self.sds / np.sqrt(np.diagonal(self.prior)))
+
+
+def _chosen(elements: Elements, var_names: str | Iterable[str] | None) -> NDArray[np.int64]:
+    if var_names is None:
+        return np.arange(len(elements.labels))
+    names = [var_names] if isinstance(var_names, str) else list(var_names)
+    if not names:
+        raise ModelError("var_names must name at least one free variable, got none")
+    columns = [column for name in names for column in elements.columns(name, "var_names")]
+    return np.array(list(dict.fromkeys(columns)))
+
+
+def _posterior_points(model: pm.Model, own: pm.Model, idata: Any, n_draws: int) -> Array:
+    checked_model(model, idata)
+    draws = unconstrained_draws(idata, own)
+    draws = draws.reshape(-1, draws.shape[-1])
+    return np.asarray(draws[np.linspace(0, len(draws) - 1, n_draws).astype(int)])
+
+
+def _table(
+    expected: Expected,
+    chosen: NDArray[np.int64],
+    full: Array,
+    passed: list[int],
+    n_full: int,
+    left_out: int,
+    at_fit: bool,
+) -> Identifiability:
+    """The table of the ``chosen`` parameters; ``full`` (n, k) are ratios at the points passed."""
+    ratios = expected.ratios
+    full_ratio = full.mean(axis=0) if passed else np.full(ratios.shape[1], np.nan)
+    q05, q95 = np.quantile(ratios, [0.05, 0.95], axis=0)
+    columns = {
+        "ratio": ratios.mean(axis=0),
+        "se": ratios.std(axis=0, ddof=1) / len(ratios) ** 0.5,
+        "q05": q05,
+        "q95": q95,
+        "coordinate": expected.kinds,
+        "prior_sd": np.sqrt(np.diagonal(expected.prior)),
+        "posterior_sd": expected.sds.mean(axis=0),
+        "full_ratio": full_ratio,
+    }
+    labels = expected.labels
+    table = pd.DataFrame(columns, index=pd.Index(labels, name="parameter")).iloc[chosen]
+    exponents, sd, ratio = determined_combinations(
+        expected.covs, expected.prior, expected.kinds, chosen
+    )
+    is_log = [bool((expected.kinds[row != 0] == "log").all()) for row in exponents]
+    names = [
+        combination_label(one, labels, is_log=log)
+        for one, log in zip(exponents, is_log, strict=True)
+    ]
+    combined = pd.DataFrame(
+        {"sd": sd, "ratio": ratio}, index=pd.Index(names, name="combination", dtype=object)
+    )
+    predicted = ratios[passed].mean(axis=0) if passed else ratios.mean(axis=0)
+    factor = np.maximum(full_ratio / predicted, predicted / full_ratio)
+    differs = [i for i in chosen if factor[i] > DIFFERENT]
+    sentences = [_head(len(ratios), left_out, at_fit)]
+    sentences += _of_combinations(table, exponents, combined, is_log, labels)
+    alone = [i for i in chosen if not exponents[:, i].any() and i not in differs]
+    sentences += _of_parameters(table.loc[[labels[i] for i in alone]])
+    sentences += _of_full(labels, differs, full_ratio, predicted, len(passed), n_full)
+    return Identifiability(
+        table,
+        directions=weak_directions(expected.covs, expected.prior, labels),
+        combinations=combined,
+        sentences=sentences,
+    )
+
+
+def _head(n_points: int, left_out: int, at_fit: bool) -> str:
+    where = "posterior" if at_fit else "prior"
+    text = (
+        f"ratio is the expected sd of the posterior over that of the prior, for records simulated "
+        f"at {n_points} draws of the {where}."
+    )
+    if not left_out:
+        return text
+    return f"{text} At {left_out} more the filter has no likelihood of simulated records."
+
+
+def _of_combinations(
+    table: pd.DataFrame,
+    exponents: NDArray[np.int64],
+    combined: pd.DataFrame,
+    is_log: list[bool],
+    labels: list[str],
+) -> list[str]:
+    found = []
+    for row, (name, values), log in zip(exponents, combined.iterrows(), is_log, strict=True):
+        members = [labels[i] for i in np.flatnonzero(row)]
+        remains = [f"{100 * table['ratio'][member]:.0f} %" for member in members]
+        found.append(
+            f"{name} is determined {precision(values['sd'], is_log=log)}, {_listed(members)} alone "
+            f"are not: {_listed(remains)} of their priors remain."
+        )
+    return found
+
+
+def _of_parameters(table: pd.DataFrame) -> list[str]:
+    """What is said of parameters that are in no combination."""
+    found = []
+    if nothing := [str(name) for name in table.index[table["ratio"] >= NOTHING]]:
+        found.append(f"The data say nothing of {_listed(nothing)}.")
+    little = table[(table["ratio"] >= WEAK) & (table["ratio"] < NOTHING)]
+    found += [
+        f"The data say little of {name}: {100 * ratio:.0f} % of its prior remains."
+        for name, ratio in little["ratio"].items()
+    ]
+    return found
+
+
+def _of_full(
+    labels: list[str],
+    differs: list[int],
+    full: Array,
+    predicted: Array,
+    n_passed: int,
+    n_full: int,
+) -> list[str]:
+    found = []
+    if n_passed < n_full:
+        found.append(
+            f"The full posteriors of {n_full - n_passed} of {n_full} simulated records are so far "
+            "from normal that importance sampling failed: simulate some records, and sample their "
+            "posteriors."
+        )
+    if differs:
+        texts = [f"of {labels[i]} {full[i]:.2g} instead of {predicted[i]:.2g}" for i in differs]
+        found.append(
+            f"The posteriors are not normal: by full posteriors of {n_passed} simulated records "
+            f"the ratio is {_listed(texts)}."
+        )
+    return found
+
+
+def _listed(texts: list[str]) -> str:
+    *first, last = texts
+    return f"{', '.join(first)} and {last}" if first else last
