@@ -57,19 +57,15 @@ def determined_combinations(
         return tried, np.empty(0), np.empty(0)
     sd, ratios = _ratios(covs, prior, tried)
     members = np.where(tried != 0, ratio, np.inf).min(axis=1)
-    good = np.flatnonzero(ratios < GAIN * members)
+    good = [int(i) for i in np.flatnonzero(ratios < GAIN * members)]
     picked: list[int] = []
-    for _ in range(_n_determined(covs, prior, weak)):
+    for rank in range(1, _n_determined(covs, prior, weak) + 1):
         # Those that are no combinations of the ones before.
-        rank = len(picked) + 1
-        good = np.array(
-            [i for i in good if np.linalg.matrix_rank(tried[[*picked, i]]) == rank], dtype=int
-        )
-        if not good.size:
+        good = [i for i in good if np.linalg.matrix_rank(tried[[*picked, i]]) == rank]
+        if not good:
             break
-        alike = good[ratios[good] <= ALIKE * ratios[good].min()]
-        simplicity = np.lexsort((ratios[alike], np.abs(tried[alike]).sum(axis=1)))
-        picked.append(int(alike[simplicity[0]]))
+        alike = [i for i in good if ratios[i] <= ALIKE * ratios[good].min()]
+        picked.append(min(alike, key=lambda i: (np.abs(tried[i]).sum(), ratios[i])))
     return tried[picked], sd[picked], ratios[picked]
 
 
