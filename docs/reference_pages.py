@@ -33,6 +33,7 @@ GROUPS = {
         "mechanics.hysteresis",
         "mechanics.hysteresis_branch",
         "mechanics.polynomial_terms",
+        "mechanics.gaussian_process_terms",
     ),
     "Parts of Markov chains": ("system.stationary",),
     "Parts of compartment models": (

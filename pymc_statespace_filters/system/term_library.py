@@ -72,25 +72,12 @@ class TermLibrary:
         ModelError
             If the number of states is another one, or `parameters` are not those of the library.
         """
-        states = self._split(x)
+        states = split_states(self.states, x)
         values = dict(zip(self.states, states, strict=True)) | self._complete(parameters)
         terms = [_product(one, states) for one in self.monomials]
         terms += [as_symbol(function.role, function(values)) for function in self.functions]
         # A constant has the shape of the others.
         return pt.stack(pt.broadcast_arrays(*terms) if states[0].type.ndim else terms)
-
-    def _split(self, x: Any) -> Sequence[TensorVariable]:
-        """The states one by one."""
-        symbol = as_symbol("x", x)
-        if symbol.type.ndim == 0 and len(self.states) == 1:
-            return [symbol]
-        n = static_shape(symbol)[0] if symbol.type.ndim else 1
-        if n != len(self.states):
-            raise ModelError(
-                f"x must hold the states of the library, {list(self.states)}, got {n}: choose "
-                "them, as in terms([x[0], x[2]])"
-            )
-        return [symbol[i] for i in range(len(self.states))]
 
     def _complete(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """All parameters, given and default ones."""
@@ -188,9 +175,7 @@ def polynomial_terms(
     >>> ([1.0, 0.0, 2.0, 0.0] @ springs([[0.0, 0.5, 1.0]], gap=0.2)).eval()
     array([0.  , 0.75, 3.  ])
     """
-    names = checked_names("states", (states,) if isinstance(states, str) else states, None)
-    if not names:
-        raise ModelError(f"states must name at least one state, got {states!r}")
+    names = state_names(states)
     lowest = check_count("lowest", lowest, 0)
     degrees = range(lowest, check_count("degree", degree, lowest) + 1)
     functions = [read_equation(name, function, names) for name, function in (also or {}).items()]
@@ -198,6 +183,28 @@ def polynomial_terms(
     if twice := [name for name, count in Counter(library.names).items() if count > 1]:
         raise ModelError(f"also must not name monomials of the library, got {twice}")
     return library
+
+
+def state_names(states: str | Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the states that terms depend on, at least one."""
+    names = checked_names("states", (states,) if isinstance(states, str) else states, None)
+    if not names:
+        raise ModelError(f"states must name at least one state, got {states!r}")
+    return names
+
+
+def split_states(names: Sequence[str], x: Any) -> list[TensorVariable]:
+    """Return the states with these names one by one, of a vector or a list of them."""
+    symbol = as_symbol("x", x)
+    if symbol.type.ndim == 0 and len(names) == 1:
+        return [symbol]
+    n = static_shape(symbol)[0] if symbol.type.ndim else 1
+    if n != len(names):
+        raise ModelError(
+            f"x must hold the states of the library, {list(names)}, got {n}: choose them, as in "
+            "terms([x[0], x[2]])"
+        )
+    return [symbol[i] for i in range(len(names))]
 
 
 def _monomials(n: int, degrees: Sequence[int]) -> list[Monomial]:
