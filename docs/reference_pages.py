@@ -114,6 +114,7 @@ GROUPS = {
         "plot_prequential",
         "plot_prior_sensitivity",
         "plot_terms",
+        "plot_designs",
         "plot_average",
     ),
     "Errors and warnings": (

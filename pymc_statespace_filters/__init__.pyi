@@ -36,6 +36,7 @@ from .filters import (
 from .parameter_particles import extend, sample_smc
 from .plots import (
     plot_average,
+    plot_designs,
     plot_drift,
     plot_evidence,
     plot_filter_health,
@@ -125,6 +126,7 @@ __all__ = [
     "panel_from",
     "pharmacometrics",
     "plot_average",
+    "plot_designs",
     "plot_drift",
     "plot_evidence",
     "plot_filter_health",

@@ -1,6 +1,7 @@
 """Plots of results; each function returns an ``arviz_plots.PlotCollection``."""
 
 from .average import plot_average
+from .designs import plot_designs
 from .drift import plot_drift
 from .evidence import plot_evidence, plot_model_probabilities
 from .filter_health import plot_filter_health
@@ -13,6 +14,7 @@ from .terms import plot_terms
 
 __all__ = [
     "plot_average",
+    "plot_designs",
     "plot_drift",
     "plot_evidence",
     "plot_filter_health",

@@ -20,6 +20,16 @@ TERMS = xr.Dataset(
     },
     coords={"term": ["c2", "k3", "k_f, k_h"]},
 )
+# As of `expected_information`, of two models.
+DESIGNS = pd.DataFrame(
+    {
+        "information": [0.5, 0.3], "low": [0.4, 0.29], "high": [0.6, 0.31], "se": [0.03, 0.002],
+        "decided": [0.8, 0.1],
+        "parameters[cubic]": [1.5, 1.25], "parameters_low[cubic]": [1.25, 1.0],
+        "parameters_high[cubic]": [1.75, 1.5], "parameters_se[cubic]": [0.25, 0.5],
+    },
+    index=pd.Index(["long", "short"], name="design"),
+)  # fmt: skip
 X = xr.DataArray(np.linspace(-2, 2, 9), coords=[("displacement", np.linspace(-2, 2, 9))])
 
 

@@ -8,6 +8,7 @@ from arviz_plots import PlotCollection
 
 from pymc_statespace_filters import (
     plot_average,
+    plot_designs,
     plot_drift,
     plot_evidence,
     plot_filter_health,
@@ -18,7 +19,7 @@ from pymc_statespace_filters import (
     plot_states,
     plot_terms,
 )
-from tests.plots.conftest import TERMS
+from tests.plots.conftest import DESIGNS, TERMS
 
 
 def run_free(idata, **settings):
@@ -51,6 +52,7 @@ PLOTS = [
     (errors_of, "free_run"),
     (in_bins, "replicated"),
     (plot_terms, "terms"),
+    (plot_designs, "designs"),
 ]
 
 
@@ -64,6 +66,11 @@ def replicated(free_run):
 @pytest.fixture(scope="session")
 def terms():
     return xr.DataTree.from_dict({"terms": TERMS})
+
+
+@pytest.fixture(scope="session")
+def designs():
+    return DESIGNS
 
 
 @pytest.fixture(scope="session")

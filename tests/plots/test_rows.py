@@ -10,13 +10,14 @@ import xarray as xr
 
 from pymc_statespace_filters import (
     compare_evidence,
+    plot_designs,
     plot_evidence,
     plot_model_probabilities,
     plot_terms,
 )
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.evidence import store_evidence
-from tests.plots.conftest import TERMS, an_evidence
+from tests.plots.conftest import DESIGNS, TERMS, an_evidence
 from tests.plots.drawn import drawn
 
 
@@ -167,3 +168,25 @@ NO_TABLE = "idata_or_table must be a table of compare_evidence"
 def test_what_is_refused(plot, given, match):
     with pytest.raises(ModelError, match=match):
         plot(given)
+
+
+def test_designs_with_bounds_and_errors():
+    collection = plot_designs(DESIGNS, backend="none")
+    assert drawn(collection, "point")["long"]["x"].item() == 0.5
+    np.testing.assert_allclose(drawn(collection, "two_se")["long"]["x"], [0.44, 0.56])
+    np.testing.assert_allclose(
+        drawn(collection, "bounds")["short"]["x"], [0.29] * 2 + [np.nan] + [0.31] * 2
+    )
+    assert drawn(collection, "text")["short"]["string"] == "0.300 ± 0.002"
+    of_cubic = plot_designs(DESIGNS, of="cubic", backend="none")
+    assert drawn(of_cubic, "point")["short"]["x"].item() == 1.25
+    np.testing.assert_allclose(drawn(of_cubic, "two_se")["short"]["x"], [0.25, 2.25])
+
+
+def test_designs_of_another_model_or_table():
+    with pytest.raises(ModelError) as raised:
+        plot_designs(DESIGNS, of="linear")
+    assert str(raised.value) == "of must be one of the models ['cubic'], got 'linear'"
+    with pytest.raises(ModelError) as raised:
+        plot_designs({"low": 1.0})
+    assert str(raised.value) == "table must be one of expected_information, got {'low': 1.0}"
