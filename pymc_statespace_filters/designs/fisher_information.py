@@ -11,7 +11,6 @@ needs as many records fewer than the mean of the products of whole scores as a r
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pymc as pm
@@ -19,9 +18,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 from scipy.stats import rankdata
 
-from ..errors import ModelError
 from ..pymc_model.at_points import ConstrainedValues
-from ..pymc_model.density import check_free_variables
 from ..pymc_model.elements import places_in_vector
 from ..pymc_model.inspection import state_space_nodes
 from ..pymc_model.term_scores import ScoredVariable
@@ -33,36 +30,6 @@ BLOCK_SIZE = 2_000_000  # numbers of simulated data that are treated at once
 LEAST_LEFT = 0.5  # share of the simulated records that must have a likelihood
 
 Array = NDArray[np.float64]
-
-
-def with_dummy_data(model: pm.Model) -> pm.Model:
-    """The model with data for StateSpace variables that have none: numbers that nothing reads.
-
-    Raises
-    ------
-    ModelError
-        If there is no StateSpace variable, or one with censored data.
-    """
-    nodes = state_space_nodes(model)
-    if not nodes:
-        names = [rv.name for rv in model.basic_RVs]
-        raise ModelError(f"model must have a StateSpace variable, got the variables {names}")
-    if censored := [name for name, node in nodes.items() if node.op.system.is_censored]:
-        raise ModelError(
-            f"model must have no censored data, got those of {censored}: which values of a record "
-            "to come are censored is not known; build the model without censored="
-        )
-    shapes: dict[str, Any] = {}
-    for name, node in nodes.items():
-        if node.outputs[1] in model.free_RVs:
-            shapes[name] = node.outputs[1].shape.eval(mode="FAST_COMPILE")
-    if shapes:
-        order = [rv.name for rv in model.free_RVs]
-        model = pm.observe(model, {name: np.zeros(shape) for name, shape in shapes.items()})
-        # The copy has them in an order that differs from process to process.
-        model.free_RVs.sort(key=lambda rv: order.index(rv.name))
-    check_free_variables(model)
-    return model
 
 
 class Coordinates:

@@ -14,19 +14,20 @@ from ..compiler.native.compilation import COMPILATION
 from ..errors import ModelError
 from ..progress import row_progress
 from ..pymc_model.checked_model import checked_model
+from ..pymc_model.density import check_free_variables
 from ..pymc_model.elements import Elements
 from ..pymc_model.inspection import given_model
 from ..pymc_model.posterior_draws import unconstrained_draws
 from ..pymc_model.prior import ModelPrior
 from ..system.checks import check_count, check_random_seed
 from ..tables import SentenceTable
+from .dummy_data import with_dummy_data
 from .fisher_information import (
     Coordinates,
     Likelihood,
     expected_posterior,
     normal_covariance,
     spread,
-    with_dummy_data,
 )
 from .full_posteriors import FullPosterior
 from .weak_directions import (
@@ -203,6 +204,7 @@ def identifiability(
     n_draws = check_count("n_draws", n_draws, 2)
     rng = check_random_seed(random_seed)
     own = with_dummy_data(given)
+    check_free_variables(own)
     elements = Elements.of(own)
     chosen = _chosen(elements, var_names)
     with COMPILATION:

@@ -19,6 +19,7 @@ from ..pymc_model.posterior_draws import unconstrained_draws
 from ..pymc_model.prior import ModelPrior
 from ..pymc_model.random_variable import PanelRV
 from ..system.model import StateSpaceModel
+from .dummy_data import with_dummy_data
 
 FEWEST = 20  # draws and records, of which a jackknife makes groups
 ALONE = "model"  # the name of a model that is given without one
@@ -95,19 +96,12 @@ def _read(model: pm.Model, idata: Any, n_draws: int, rng: np.random.Generator) -
             f"{short_form(filter)}, whose noise would count as information: use another one, such "
             "as EKF, UKF, IPLF or GridFilter"
         )
-    if system.is_censored:
-        raise ModelError(
-            f"{name!r} must have no censored values, as simulated records have none: build the "
-            "model without censored="
-        )
     if node.op.score_from:
         raise ModelError(
             f"score_from of {name!r} must be 0, as a new record begins at the start, got "
             f"{node.op.score_from}"
         )
-    if node.outputs[1] not in model.observed_RVs:
-        rows = node.inputs[-4].shape[0].eval(mode="FAST_COMPILE")
-        model = pm.observe(model, {name: np.zeros((int(rows), system.p))})
+    model = with_dummy_data(model)
     if idata is not None:
         model = checked_model(model, idata)
     theta, n_given = _theta(model, name, idata, n_draws, rng)

@@ -2,6 +2,7 @@
 
 import arviz as az
 import numpy as np
+import pandas as pd
 import pymc as pm
 import pytensor.tensor as pt
 import pytest
@@ -222,6 +223,73 @@ def test_an_approximate_filter_is_doubted():
     found = psf.expected_information(built, {"x": {"steps": [1, 2]}}, **FEW)
     assert found.sentences[-1] == (
         "The likelihood of 'model' is a filter's approximation; se does not include its error."
+    )
+
+
+def test_a_filter_without_a_pass_of_many_points():
+    """`GridFilter`, exact here, has the numbers of the Kalman filter."""
+    own = {"late": DESIGNS["late"]}
+    settings = FEW | {"n_records": 20, "n_draws": 20}
+    by_grid, by_kalman = (
+        psf.expected_information(model(filter=filter), own, **settings)
+        for filter in (psf.GridFilter(), psf.EKF())
+    )
+    np.testing.assert_allclose(by_grid, by_kalman, atol=2e-3)
+
+
+def counts(dt=1.0, event=False):
+    """Two sums since the last value of each, and an input, at any times."""
+    events = {"event": lambda x, dose: [x[0] + dose, x[1], x[2]], "events": ["dose"]}
+    system = psf.StateSpaceModel(
+        transition=psf.EulerMaruyama(
+            lambda x, u, a: [-a * x[0] + u[0], x[0], x[0]], np.diag([0.1, 0, 0])[:, :1], dt=dt
+        ),
+        observation=lambda x: [x[1], x[2]],
+        observation_noise=np.diag([0.1, 0.1]),
+        initial_mean=[1.0, 0.0, 0.0],
+        initial_cov=np.diag([0.1, 0.0, 0.0]),
+        states=["rate", "first", "second"],
+        accumulators=["first", "second"],
+        observables=["first", "second"],
+        inputs=["u"],
+        resets="seen",
+        **(events if event else {}),
+    )
+    with pm.Model() as built:
+        pm.HalfNormal("a")
+        none = {"events": {"time": [], "dose": []}} if event else {}
+        psf.StateSpace("d", system, psf.EKF(), times=[dt], inputs=[0.0], **none)
+    return built
+
+
+def test_a_sum_that_a_design_does_not_measure_goes_on():
+    rivals = read_rivals({"a": counts()}, None, 20, np.random.default_rng(1))
+    design = {"times": [1, 2, 4], "inputs": np.zeros(4)}
+    both, one = (
+        read_designs({"x": design | more}, rivals)["x"][0] for more in ({}, {"sensors": ["second"]})
+    )
+    np.testing.assert_array_equal(both.inputs[:, -2:], [[0, 0], [1, 1], [1, 1], [0, 0]])
+    np.testing.assert_array_equal(one.inputs[:, -2:], [[0, 0], [0, 1], [0, 1], [0, 0]])
+
+
+def test_designs_with_dates_events_and_inputs_at_times():
+    times = pd.date_range("2030-01-01", periods=4)
+    doses = pd.DataFrame({"time": [pd.Timestamp("2030-01-02 07:00")], "dose": [2.0]})
+    design = {"times": times, "t0": times[0] - pd.Timedelta("1D"), "unit": "D", "events": doses}
+    design |= {"inputs": [0.0, 1.0], "input_times": times[[0, 2]] - pd.Timedelta("29h")}
+    none = design | {"events": doses.iloc[:0]}
+    found = psf.expected_information(counts(event=True), {"dose": design, "none": none}, **FEW)
+    assert list(found.index) == ["dose", "none"]
+    assert found.loc["none", "diff"] + 2 * found.loc["none", "dse"] < 0
+
+
+def test_models_measure_at_the_same_times():
+    rivals = {"fine": counts(0.5), "coarse": counts(1.0)}
+    refused(
+        "designs['x'] must measure all models at the same times, got 2.0 as the last one of "
+        "models['coarse'] and 1.0 before: give times= in place of steps=",
+        models=rivals,
+        designs={"x": {"steps": [1, 2], "inputs": np.zeros(2)}},
     )
 
 

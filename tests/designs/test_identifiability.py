@@ -8,11 +8,11 @@ import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.designs.dummy_data import with_dummy_data
 from pymc_statespace_filters.designs.fisher_information import (
     Coordinates,
     Likelihood,
     normal_covariance,
-    with_dummy_data,
 )
 from pymc_statespace_filters.designs.weak_directions import (
     combination_label,
