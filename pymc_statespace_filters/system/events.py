@@ -93,7 +93,8 @@ def read_events(
             )
         return None
     columns = _columns(table, names)
-    times = clock.numbers(f"events[{TIME!r}]", columns.pop(TIME), record)
+    given = columns.pop(TIME)  # an empty column has no dates, even where times are dates
+    times = clock.numbers(f"events[{TIME!r}]", given, record) if np.size(given) else np.zeros(0)
     before = columns.pop(BEFORE, np.zeros(times.size))
     values = [_numbers(name, columns[name], times.size) for name in names]
     flags = _numbers(BEFORE, before, times.size)
