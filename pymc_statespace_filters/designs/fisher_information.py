@@ -28,6 +28,8 @@ FAR_OUT = 30.0  # in the unconstrained space: near the end of a support
 ONE_SD = 0.15865525393145707  # probability below a normal variable's mean minus its sd
 BLOCK_SIZE = 2_000_000  # numbers of simulated data that are treated at once
 LEAST_LEFT = 0.5  # share of the simulated records that must have a likelihood
+N_TRIED = 20  # records, to have one that is finite
+HUGE = 1e7  # score of a row by a standard deviation of the prior, of a state that explodes
 
 Array = NDArray[np.float64]
 
@@ -105,9 +107,10 @@ class Likelihood:
         """Rows of a record, of all variables."""
         return sum(len(variable.observed) for variable in self.variables)
 
-    def simulate(self, x: Array, count: int, rng: np.random.Generator) -> list[Array]:
-        """Data sets (count, J, p) of every variable at a point x (k,)."""
-        return [variable.simulate(x, count, rng) for variable in self.variables]
+    def record(self, x: Array, rng: np.random.Generator) -> list[Array]:
+        """A data set (1, J, p) of every variable at a point x (k,), finite if one of some is."""
+        drawn = [(variable, variable.simulate(x, N_TRIED, rng)) for variable in self.variables]
+        return [found[[np.argmax(_are_finite(variable, found))]] for variable, found in drawn]
 
     def values(self, x: Array, records: list[Array]) -> Array:
         """The log-likelihood (m,) of one record at points x (m, k); -inf where there is none."""
@@ -129,8 +132,10 @@ class Likelihood:
             products, n_left = np.zeros_like(total), 0
             size = (2 * len(x) + 1) * variable.observed.size
             for part in np.array_split(np.arange(count), -(-count * size // BLOCK_SIZE)):
-                scores = _row_scores(variable, variable.simulate(x, len(part), rng), x, self._sd)
-                scores = scores[np.isfinite(scores).all(axis=(1, 2))]
+                drawn = variable.simulate(x, len(part), rng)
+                scores = _row_scores(variable, drawn, x, self._sd)
+                is_known = (np.abs(scores * self._sd) < HUGE).all(axis=(1, 2))
+                scores = scores[is_known & _are_finite(variable, drawn)]
                 products += np.einsum("mjx,mjy->xy", scores, scores)
                 n_left += len(scores)
             if n_left < LEAST_LEFT * count:
@@ -138,6 +143,11 @@ class Likelihood:
             total += products / n_left
         self.on_progress(count)
         return total
+
+
+def _are_finite(variable: ScoredVariable, observed: Array) -> NDArray[np.bool_]:
+    """Whether each of data sets (m, J, p) is, which may have exploded; a filter skips NaN."""
+    return (np.isfinite(observed) | np.isnan(variable.observed)).all(axis=(1, 2))
 
 
 def _row_scores(variable: ScoredVariable, observed: Array, x: Array, sd: Array) -> Array:
@@ -162,4 +172,7 @@ def expected_posterior(cov: Array, information: Array) -> Array:
     """The covariance (k, k) by a prior of covariance ``cov`` and data of this information."""
     sd = np.sqrt(np.diagonal(cov))
     units = np.outer(sd, sd)
-    return np.asarray(units * np.linalg.inv(np.linalg.inv(cov / units) + information * units))
+    # Of a product with its transpose, which rounding leaves positive definite.
+    factor = np.linalg.cholesky(np.linalg.inv(cov / units) + information * units)
+    root = sd[:, None] * np.linalg.inv(factor).T
+    return np.asarray(root @ root.T)

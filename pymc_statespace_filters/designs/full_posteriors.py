@@ -9,11 +9,11 @@ from ..statistics.importance import largest_good_k, normalised, smoothed, system
 from ..statistics.student_mixture import StudentMixture, mixture_of
 from .fisher_information import Coordinates, Likelihood, spread
 
-N_DRAWS = 2000  # of each importance sample
-ENOUGH = 0.5  # effective share of the draws, from which the shape of the tail is of no interest
-N_FIRST = 1000  # of those that find the shape of the proposals
-N_COMPONENTS = 4
+N_DRAWS, N_ROUNDS = 2000, 8  # of importance samples, each with proposals fitted to the one before
+N_COMPONENTS = 8  # of proposals: a posterior may be a narrow, bent ridge
 WIDE = {2.0: 0.2}  # scales of further components, with their weights
+# Effective share of the draws that a sample has at least; and from which its tail may be any.
+LEAST, ENOUGH = 0.3, 0.5
 N_NEWTON, N_HALVINGS, SETTLED = 20, 6, 1e-3  # SETTLED in nats
 STEP = 1e-4  # of differences of the prior, in standard deviations
 
@@ -41,28 +41,29 @@ class FullPosterior:
         ``cov`` (k, k) is the expected covariance of the coordinates. None if importance sampling
         fails.
         """
-        records = self._likelihood.simulate(x, 1, rng)
+        records = self._likelihood.record(x, rng)
         inverse = np.linalg.inv(self._coordinates.jacobian(x, self._sd))
         own = inverse @ cov @ inverse.T
         mode = self._mode(x, own, records)
         proposal = StudentMixture(np.ones(1), mode[None], np.linalg.cholesky(own)[None])
-        for count in (N_FIRST, N_FIRST, N_DRAWS):
+        for _ in range(N_ROUNDS):
             proposal = proposal.with_wide_parts(WIDE)
-            draws = proposal.sample(count, rng)
+            draws = proposal.sample(N_DRAWS, rng)
             log_weights = self._log_density(draws, records) - proposal.log_density(draws)
             if not np.isfinite(log_weights).any():
                 return None
             log_weights, pareto_k = smoothed(log_weights)
             weights = normalised(log_weights)
-            draws = draws[systematic(weights, count, rng)]
-            if (fitted := mixture_of(draws, N_COMPONENTS, rng)) is None:
+            share = 1 / (weights**2).sum() / N_DRAWS
+            draws = draws[systematic(weights, N_DRAWS, rng)]
+            if share > (LEAST if pareto_k <= largest_good_k(N_DRAWS) else ENOUGH):
+                self._likelihood.on_progress(1)
+                return spread(self._coordinates(draws))
+            fitted = mixture_of(draws, N_COMPONENTS, rng)
+            if fitted is None:
                 return None
             proposal = fitted
-        self._likelihood.on_progress(1)
-        # A tail of nearly equal weights may have any shape.
-        if pareto_k > largest_good_k(N_DRAWS) and (weights**2).sum() > 1 / (ENOUGH * N_DRAWS):
-            return None
-        return spread(self._coordinates(draws))
+        return None
 
     def _log_density(self, x: Array, records: list[Array]) -> Array:
         """The log-density (m,) of the posterior at x (m, k), -inf where there is none."""

@@ -40,7 +40,7 @@ from .weak_directions import (
 
 N_PRIOR = 4000  # draws, for the covariance of the prior
 LEAST_ROWS, ROWS_OF_PARAMETER = 500, 50  # rows of all simulated records of a point
-LEAST_LEFT = 0.5  # share of the points that must have a likelihood
+LEAST_LEFT = 0.25  # share of the points that must have a likelihood
 N_FULL = 6  # full posteriors
 DIFFERENT = 1.25  # factor between two ratios from which a posterior is not normal
 NOTHING = 0.97  # ratio, from which a parameter is as uncertain as before
@@ -231,9 +231,9 @@ def identifiability(
                 kept.append(i)
         if len(kept) < LEAST_LEFT * len(x):
             raise ModelError(
-                "simulated records must have a likelihood by the filter at most points, got one at "
-                f"{len(kept)} of {len(x)}: give the model a prior with less mass where its "
-                "equations have no solution"
+                "simulated records must be finite and have a likelihood by the filter at a quarter "
+                f"of the points, got {len(kept)} of {len(x)}: give the model a prior with less "
+                "mass where its equations have no solution"
             )
         announce("full posteriors", N_FULL)
         tried = range(min(N_FULL, len(kept)))
@@ -342,7 +342,10 @@ def _head(n_points: int, left_out: int, at_fit: bool) -> str:
     )
     if not left_out:
         return text
-    return f"{text} At {left_out} more the filter has no likelihood of simulated records."
+    return (
+        f"{text} {left_out} further draws are left out: records simulated there are not finite, or "
+        "have no likelihood by the filter."
+    )
 
 
 def _of_combinations(
@@ -355,25 +358,28 @@ def _of_combinations(
     found = []
     for row, (name, values), log in zip(exponents, combined.iterrows(), is_log, strict=True):
         members = [labels[i] for i in np.flatnonzero(row)]
-        remains = [f"{100 * table['ratio'][member]:.0f} %" for member in members]
         found.append(
             f"{name} is determined {precision(values['sd'], is_log=log)}, {_listed(members)} alone "
-            f"are not: {_listed(remains)} of their priors remain."
+            f"are not: {_remain(table['ratio'][members])}."
         )
     return found
 
 
 def _of_parameters(table: pd.DataFrame) -> list[str]:
     """What is said of parameters that are in no combination."""
-    found = []
-    if nothing := [str(name) for name in table.index[table["ratio"] >= NOTHING]]:
+    found, ratio = [], table["ratio"]
+    if nothing := [str(name) for name in table.index[ratio >= NOTHING]]:
         found.append(f"The data say nothing of {_listed(nothing)}.")
-    little = table[(table["ratio"] >= WEAK) & (table["ratio"] < NOTHING)]
-    found += [
-        f"The data say little of {name}: {100 * ratio:.0f} % of its prior remains."
-        for name, ratio in little["ratio"].items()
-    ]
+    if little := [str(name) for name in table.index[(ratio >= WEAK) & (ratio < NOTHING)]]:
+        found.append(f"The data say little of {_listed(little)}: {_remain(ratio[little])}.")
     return found
+
+
+def _remain(ratio: pd.Series) -> str:
+    shares = [f"{100 * value:.0f} %" for value in ratio]
+    if len(shares) == 1:
+        return f"{shares[0]} of its prior remains"
+    return f"{_listed(shares)} of their priors remain"
 
 
 def _of_full(

@@ -125,10 +125,7 @@ def test_information_of_an_autoregression():
     np.testing.assert_allclose(found[1, 1], 2 * n_rows, rtol=0.06)  # of the logarithm of a scale
     assert abs(found[0, 1]) < 0.1 * (found[0, 0] * found[1, 1]) ** 0.5
     # Whole scores have the same mean of products, with thirty times the variance.
-    records = likelihood.simulate(x, 1000, rng)
-    scores = np.array(
-        [likelihood.gradient(x, [y[i : i + 1] for y in records]) for i in range(1000)]
-    )
+    scores = np.array([likelihood.gradient(x, likelihood.record(x, rng)) for _ in range(1000)])
     np.testing.assert_allclose(np.diagonal(scores.T @ scores / 1000), np.diagonal(found), rtol=0.2)
 
 
@@ -317,6 +314,7 @@ def test_models_that_cannot_be_treated():
             **record | {"params": {"a": pt.log(-(a**2)), **record["params"]}},
         )
     assert refusal(impossible, n_draws=4) == (
-        "simulated records must have a likelihood by the filter at most points, got one at 0 of 4: "
-        "give the model a prior with less mass where its equations have no solution"
+        "simulated records must be finite and have a likelihood by the filter at a quarter of the "
+        "points, got 0 of 4: give the model a prior with less mass where its equations have no "
+        "solution"
     )
