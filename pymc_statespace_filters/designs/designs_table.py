@@ -56,11 +56,13 @@ def table_of(
     n_kept: Mapping[str, Sequence[int]],
     rivals: Mapping[str, Rival],
     weights: Array,
+    var_names: Sequence[str] | None,
 ) -> DesignsTable:
     """The table of quantities by design, see `information.replicates`.
 
     ``n_kept`` are the numbers of records of each model under each design.
     """
+    about = "the parameters" if var_names is None else joined(list(var_names))
     ranks_by = PARAMETERS + "[0]" if len(rivals) == 1 else MODEL
     order, differences = best_first({name: own[ranks_by] for name, own in replicated.items()})
     rows = {
@@ -72,7 +74,7 @@ def table_of(
     }
     data = pd.DataFrame.from_dict(rows, orient="index")
     data.index.name = "design"
-    return DesignsTable(data, sentences=list(_sentences(data, rivals, weights)))
+    return DesignsTable(data, sentences=list(_sentences(data, rivals, weights, about)))
 
 
 def _ranking(own: Mapping[str, Array], ranks_by: str, difference: Estimate) -> dict[str, Any]:
@@ -109,9 +111,11 @@ def _further(
     return found
 
 
-def _sentences(table: pd.DataFrame, rivals: Mapping[str, Rival], weights: Array) -> Iterator[str]:
+def _sentences(
+    table: pd.DataFrame, rivals: Mapping[str, Rival], weights: Array, about: str
+) -> Iterator[str]:
     if len(rivals) == 1:
-        yield "Ranked by the expected information about the parameters, in nats."
+        yield f"Ranked by the expected information about {about}, in nats."
     else:
         entropy = -(weights * np.log(weights)).sum()
         yield (
@@ -119,7 +123,7 @@ def _sentences(table: pd.DataFrame, rivals: Mapping[str, Rival], weights: Array)
             f"{entropy:.3f}."
         )
     yield from _not_told_apart(table)
-    yield from _above_the_draws(table, rivals)
+    yield from _above_the_draws(table, rivals, about)
     for name, rival in rivals.items():
         if len(rival.theta) < rival.n_given:
             yield (
@@ -145,19 +149,20 @@ def _not_told_apart(table: pd.DataFrame) -> Iterator[str]:
         )
 
 
-def _above_the_draws(table: pd.DataFrame, rivals: Mapping[str, Rival]) -> Iterator[str]:
+def _above_the_draws(table: pd.DataFrame, rivals: Mapping[str, Rival], about: str) -> Iterator[str]:
     """Say where so few draws are near the one that made a record that they tell too little."""
     for name, rival in rivals.items():
-        low = table["low"] if len(rivals) == 1 else table[f"{PARAMETERS}_low[{name}]"]
+        low, high = (
+            table[end] if len(rivals) == 1 else table[f"{PARAMETERS}_{end}[{name}]"]
+            for end in ("low", "high")
+        )
         most = math.log(len(rival.theta))
-        if not (near := list(table.index[low > most - 1])):
+        if not (near := list(table.index[(low > most - 1) | (high - low > 1)])):
             continue
         remedy = "more n_draws" if len(rival.theta) == rival.n_given else "longer chains"
-        about = f"the information about the parameters{_of(name, rivals)}"
-        if len(rivals) > 1:
-            about += ", and of which model,"
+        which = ", and about which model," if len(rivals) > 1 else ""
         yield (
-            f"With {joined([repr(one) for one in near])} {about} is near the log of the number of "
-            f"draws, {most:.1f}, above which it is not seen: there low is a lower bound, and the "
-            f"others are not reliable; {remedy} would show more."
+            f"With {quoted(near)} information about {about}{_of(name, rivals)}{which} may be above "
+            f"what the draws can show, the log of their number, {most:.1f}: there low is a lower "
+            f"bound, and the others are not reliable; {remedy} would show more."
         )

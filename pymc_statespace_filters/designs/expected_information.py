@@ -1,7 +1,7 @@
 """The public function: what a record of each design is expected to say, before it is measured."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,7 @@ def expected_information(
     n_draws: int = 1000,
     model_prior: Mapping[str, float] | None = None,
     odds: float = 20,
+    var_names: Sequence[str] | None = None,
     target_se: float | None = None,
     cores: int | None = None,
     comm: Any = None,
@@ -71,6 +72,11 @@ def expected_information(
         Positive weight of every model before the new record, normalised here; equal by default.
     odds : float
         At which odds, at least 1, a model counts as decided for.
+    var_names : sequence of str, optional
+        Free variables of every model, independent of the others in its prior: the information about
+        parameters is about these alone, and the others, such as the level of the noise, are unknown
+        before the record and after it. Twice as many likelihoods are computed for one model. With
+        ``idata``, whose draws are dependent, it must be None.
     target_se : float, optional
         The number of records is doubled, up to 16 times ``n_records``, until ``se`` is not larger
         in any design.
@@ -174,7 +180,7 @@ def expected_information(
     rng = check_random_seed(random_seed)
     weights = prior_weights(model_prior, list(named))
     seed = int(rng.integers(2**63))
-    rivals = read_rivals(named, idata, n_draws, rng)
+    rivals = read_rivals(named, idata, n_draws, rng, var_names)
     candidates = read_designs(designs, rivals)
     numbers = np.array([len(rival.theta) for rival in rivals.values()])
     n_groups = int(min(_MOST_GROUPS, n_wanted, numbers.min()))
@@ -187,7 +193,7 @@ def expected_information(
                 for d, name in enumerate(candidates)
             }
             n_kept = _kept(own, list(candidates), list(rivals))
-            table = table_of(found, n_kept, rivals, weights)
+            table = table_of(found, n_kept, rivals, weights, var_names)
             n = own.shape[-1]
             if target is None or (table["se"] <= target).all() or n >= _MOST_TIMES * n_wanted:
                 break

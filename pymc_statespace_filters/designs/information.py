@@ -27,6 +27,9 @@ class Records(NamedTuple):
 
     ``own`` (M, R), NaN for a record that is left out; ``sums`` (M, R, M, G), without the draw that
     made the record; and the number of draws of each model, ``n_draws`` (M,).
+
+    For the information about some variables alone, ``sums`` are (M, R, M + 1, G). The last are over
+    draws of the record's own model, with the values of these variables that made the record.
     """
 
     own: Array
@@ -75,7 +78,9 @@ def replicates(records: Records, weights: Array, odds: float) -> dict[str, Array
 
     ``parameters_low[i]``, ``parameters_high[i]``
         Information about the parameters of model i: with the draw that made the record among those
-        of its evidence (contrastive, a lower bound), and without it (nested, an upper bound).
+        of its evidence (contrastive, a lower bound), and without it (nested, an upper bound). About
+        some variables, the likelihood given these is a mean, too: without that draw in the lower
+        bound, and with it in the upper one.
     ``model_low``, ``model_high``
         Information about which model: E log q(m | y) plus the entropy of the weights, by evidences
         without that draw (a lower bound), and with it in the evidence of the true model.
@@ -97,15 +102,15 @@ def _quantities(records: Records, weights: Array, odds: float) -> Iterator[tuple
         [np.ones(n_groups), 1 - np.eye(n_groups), *(np.arange(n_groups) % 2 == i for i in (0, 1))]
     )
     evidences = [_evidences(records, members, i) for i in range(n_models)]
-    for i, (without, including, own, kept) in enumerate(evidences):
-        low, high = _mean(own - including, kept), _mean(own - without[:, i], kept)
+    for i, (without, including, lowest, highest, kept) in enumerate(evidences):
+        low, high = _mean(lowest - including, kept), _mean(highest - without[:, i], kept)
         yield from _between(PARAMETERS, low, high, f"[{i}]")
     if n_models == 1:
         return
     entropy = -(weights * np.log(weights)).sum()
     about = np.zeros((2, len(members)))
     shares: dict[str, Array] = {DECIDED: np.zeros(len(members)), MISLED: np.zeros(len(members))}
-    for i, (without, including, _, kept) in enumerate(evidences):
+    for i, (without, including, *_, kept) in enumerate(evidences):
         joint = without + np.log(weights)[:, None]
         with_own = joint.copy()
         with_own[:, i] = including + np.log(weights[i])
@@ -125,24 +130,33 @@ def _quantities(records: Records, weights: Array, odds: float) -> Iterator[tuple
     yield from shares.items()
 
 
-def _evidences(records: Records, members: Array, i: int) -> tuple[Array, Array, Array, Array]:
+def _evidences(records: Records, members: Array, i: int) -> tuple[Array, ...]:
     """Of the R records of model i that are kept, with each of S sets of groups.
 
     Log-evidences of all models without the draw that made the record (R, M, S), that of the model
-    with it (R, S), the log-likelihood at it (R, 1), and whether the record counts (R, S).
+    with it (R, S), the least and the greatest log-likelihood given the parameters asked about
+    (R, 1 or S), and whether the record counts (R, S).
     """
-    n_groups, draws = members.shape[1], np.arange(records.n_draws.max())
-    counts = np.array([np.bincount(draws[:n] % n_groups, None, n_groups) for n in records.n_draws])
+    (n_models, _, n_sums, n_groups), n = records.sums.shape, records.n_draws
+    counts = np.array([group_counts(size, n_groups) for size in n])[[*range(n_models), i][:n_sums]]
     numbers = np.flatnonzero(~np.isnan(records.own[i]))
-    groups = numbers % records.n_draws[i] % n_groups
+    groups = numbers % n[i] % n_groups
     sums = _log_sums(records.sums[i, numbers])
     n_in = np.broadcast_to(counts @ members.T, sums.shape).copy()
-    n_in[:, i] -= members.T[groups]
+    of_own = [i, *range(n_models, n_sums)]
+    n_in[:, of_own] -= members.T[groups][:, None]
     own = records.own[i, numbers, None]
-    including = np.logaddexp(sums[:, i], own) - np.log(n_in[:, i] + 1)
+    including = np.logaddexp(sums[:, of_own], own[:, None]) - np.log(n_in[:, of_own] + 1)
+    without = sums - np.log(n_in)
     kept = members.T[groups].copy()
     kept[:, -2:] = 1.0  # half of the draws, and all records
-    return sums - np.log(n_in), including, own, kept
+    given = (own, own) if n_sums == n_models else (without[:, -1], including[:, -1])
+    return without[:, :n_models], including[:, 0], *given, kept
+
+
+def group_counts(n: int, n_groups: int) -> NDArray[np.int64]:
+    """How many of n draws each group has."""
+    return np.bincount(np.arange(n) % n_groups, minlength=n_groups)
 
 
 def _log_sums(sums: Array) -> Array:

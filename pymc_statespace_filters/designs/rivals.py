@@ -1,12 +1,13 @@
 """Rival models as designs see them: one system, its filter, and independent draws of theta."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
+from pytensor.graph.traversal import ancestors
 
 from ..errors import DataMismatchError, ModelError
 from ..filters.protocol import Filter
@@ -14,6 +15,7 @@ from ..filters.written import short_form
 from ..pymc_model.at_points import GraphsAtPoints
 from ..pymc_model.checked_model import checked_model
 from ..pymc_model.density import check_free_variables
+from ..pymc_model.elements import places_in_vector
 from ..pymc_model.inspection import exactness, state_space_nodes
 from ..pymc_model.posterior_draws import unconstrained_draws
 from ..pymc_model.prior import ModelPrior
@@ -28,13 +30,18 @@ Array = NDArray[np.float64]
 
 
 class Rival(NamedTuple):
-    """A model: theta (n, k) at independent draws, thinned from ``n_given`` if they were given."""
+    """A model: theta (n, k) at independent draws, thinned from ``n_given`` if they were given.
+
+    ``mixed`` (j) is theta (n, k) where the variables asked about have the values of draw j, and the
+    others those of all draws; None where all are asked about.
+    """
 
     system: StateSpaceModel
     filter: Filter
     theta: Array
     n_given: int
     is_exact: bool
+    mixed: Callable[[int], Array] | None
 
 
 def named_models(models: Any) -> dict[str, pm.Model]:
@@ -47,7 +54,11 @@ def named_models(models: Any) -> dict[str, pm.Model]:
 
 
 def read_rivals(
-    models: Mapping[str, pm.Model], idata: Any, n_draws: int, rng: np.random.Generator
+    models: Mapping[str, pm.Model],
+    idata: Any,
+    n_draws: int,
+    rng: np.random.Generator,
+    var_names: Sequence[str] | None = None,
 ) -> dict[str, Rival]:
     """The models with draws of their priors, or of ``idata``, a DataTree or one for each model.
 
@@ -69,7 +80,7 @@ def read_rivals(
     for name, model in models.items():
         own = None if idata is None else idata[name]
         try:
-            found[name] = _read(model, own, n_draws, rng)
+            found[name] = _read(model, own, n_draws, rng, var_names)
         except (ModelError, DataMismatchError) as error:
             place = "models" if list(models) == [ALONE] else f"models[{name!r}]"
             raise type(error)(f"{place}: {error}") from None
@@ -79,7 +90,13 @@ def read_rivals(
     return found
 
 
-def _read(model: pm.Model, idata: Any, n_draws: int, rng: np.random.Generator) -> Rival:
+def _read(
+    model: pm.Model,
+    idata: Any,
+    n_draws: int,
+    rng: np.random.Generator,
+    var_names: Sequence[str] | None,
+) -> Rival:
     nodes = state_space_nodes(model)
     if len(nodes) != 1:
         raise ModelError(f"a design needs a model with one StateSpace variable, got {list(nodes)}")
@@ -104,28 +121,61 @@ def _read(model: pm.Model, idata: Any, n_draws: int, rng: np.random.Generator) -
     model = with_dummy_data(model)
     if idata is not None:
         model = checked_model(model, idata)
-    theta, n_given = _theta(model, name, idata, n_draws, rng)
-    return Rival(system, filter, np.ascontiguousarray(theta), n_given, exactness(model))
-
-
-def _theta(
-    model: pm.Model, name: str, idata: Any, n_draws: int, rng: np.random.Generator
-) -> tuple[Array, int]:
-    """Parameters of the variable at independent draws, and how many draws there were."""
+    x, n_given = _draws(model, idata, n_draws, rng)
+    columns = None if var_names is None else _columns(model, idata, var_names)
     graph = state_space_nodes(model)[name].inputs[-5]
     if not model.free_RVs:
-        return np.tile(graph.eval(mode="FAST_COMPILE"), (n_draws, 1)), n_draws
+        theta = np.tile(graph.eval(mode="FAST_COMPILE"), (n_draws, 1))
+        return Rival(system, filter, theta, n_draws, exactness(model), None)
+    graphs = GraphsAtPoints(model, [graph])
+
+    def theta_at(points: Array) -> Array:
+        return np.ascontiguousarray(graphs(points)[0])
+
+    def mixed(j: int) -> Array:
+        points = x.copy()
+        points[:, columns] = x[j, columns]
+        return theta_at(points)
+
+    own = None if columns is None else mixed
+    return Rival(system, filter, theta_at(x), n_given, exactness(model), own)
+
+
+def _draws(
+    model: pm.Model, idata: Any, n_draws: int, rng: np.random.Generator
+) -> tuple[Array, int]:
+    """Independent draws (n, k), and how many there were."""
+    if not model.free_RVs:
+        return np.zeros((n_draws, 0)), n_draws
     check_free_variables(model)
     if idata is not None:
-        x, n_given = _independent(unconstrained_draws(idata, model), n_draws, rng)
-    elif model.potentials:
+        return _independent(unconstrained_draws(idata, model), n_draws, rng)
+    if model.potentials:
         raise ModelError(
             f"draws of the prior leave out the potentials {[p.name for p in model.potentials]}: "
             "give draws as idata="
         )
-    else:
-        x, n_given = ModelPrior(model).sample(n_draws, rng), n_draws
-    return GraphsAtPoints(model, [graph])(x)[0], n_given
+    return ModelPrior(model).sample(n_draws, rng), n_draws
+
+
+def _columns(model: pm.Model, idata: Any, var_names: Sequence[str]) -> NDArray[np.int64]:
+    """The columns of some variables, which must be independent of the others."""
+    names = [rv.name for rv in model.free_RVs]
+    is_list = isinstance(var_names, list | tuple) and var_names
+    if not is_list or any(name not in names for name in var_names):
+        raise ModelError(f"var_names must be a list of some of {names}, got {var_names!r}")
+    if idata is not None:
+        raise ModelError("var_names must be None with idata, whose draws are dependent")
+    chosen = [rv for rv in model.free_RVs if rv.name in var_names]
+    above = set(ancestors(chosen))
+    others = [rv for rv in model.free_RVs if rv not in chosen]
+    if joint := [rv.name for rv in others if rv in above or {*ancestors([rv])} & {*chosen}]:
+        raise ModelError(
+            f"var_names must be independent of the other variables in the prior, got "
+            f"{list(var_names)} beside {joint}: name those, too"
+        )
+    places = places_in_vector(model)
+    return np.concatenate([places[rv.name].ravel() for rv in chosen])
 
 
 def _independent(draws: Array, n_draws: int, rng: np.random.Generator) -> tuple[Array, int]:

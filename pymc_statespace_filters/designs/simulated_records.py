@@ -26,7 +26,6 @@ from .rivals import Rival
 _ANY_SEED = np.asarray(0)  # of likelihoods without noise
 
 Array = NDArray[np.float64]
-Likelihoods = Callable[[Candidate, Array], Array]
 
 
 class SimulatedRecords:
@@ -41,6 +40,8 @@ class SimulatedRecords:
     ) -> None:
         self._designs, self._rivals = designs, rivals
         self._n_groups, self._seed = n_groups, seed
+        self._mixed: dict[tuple[int, int], Array] = {}  # theta, by model and draw
+        self._n_sums = len(rivals) + any(rival.mixed is not None for rival in rivals)
         for candidates in designs:  # compiles, before there are threads
             for candidate, rival in zip(candidates, rivals, strict=True):
                 candidate.simulated(rival.theta[0], np.random.default_rng(0))
@@ -54,8 +55,13 @@ class SimulatedRecords:
         """The log-likelihoods of records (D, M, R) at their own draws, and sums (D, M, R, M, G).
 
         ``numbers`` are those of the R records. NaN where a record, or its log-likelihood at the
-        draw that made it, is not finite.
+        draw that made it, is not finite. Where information about some variables is asked for, there
+        are sums (D, M, R, M + 1, G), see `information.Records`.
         """
+        for m, rival in enumerate(self._rivals):  # PyTensor's functions are not for threads
+            for at in {r % len(rival.theta) for r in numbers}:
+                if rival.mixed is not None and (m, at) not in self._mixed:
+                    self._mixed[m, at] = rival.mixed(at)
         shape = len(numbers), len(self._rivals), len(self._designs)
         rows = np.stack(np.unravel_index(np.arange(np.prod(shape)), shape), axis=1)
         rows[:, 0] += numbers.start
@@ -78,7 +84,7 @@ class SimulatedRecords:
         )
 
     def _empty(self, n_rows: int) -> list[Array]:
-        return [np.empty(n_rows), np.empty((n_rows, len(self._rivals), self._n_groups))]
+        return [np.empty(n_rows), np.empty((n_rows, self._n_sums, self._n_groups))]
 
     def _in_threads(
         self, rows: NDArray[np.int64], on_progress: Callable[[int], None]
@@ -107,20 +113,24 @@ class SimulatedRecords:
         candidates, theta = self._designs[d], self._rivals[m].theta
         at = r % len(theta)
         observed = candidates[m].simulated(theta[at], np.random.default_rng([self._seed, m, r]))
-        own, sums = np.nan, np.full((len(self._rivals), self._n_groups), np.nan)
+        own, sums = np.nan, np.full((self._n_sums, self._n_groups), np.nan)
         if not np.isfinite(observed[:, candidates[m].sensors]).all():
             return own, sums
         for i, (rival, candidate) in enumerate(zip(self._rivals, candidates, strict=True)):
-            found = _likelihoods(rival, candidate)(observed)
+            found = _likelihoods(rival, candidate)(rival.theta, observed)
             if i == m:
                 own, found[at] = found[at], -np.inf
             sums[i] = group_sums(found, self._n_groups)
+        if (mixed := self._mixed.get((m, at))) is not None:
+            found = _likelihoods(self._rivals[m], candidates[m])(mixed, observed)
+            found[at] = -np.inf
+            sums[-1] = group_sums(found, self._n_groups)
         return (own if np.isfinite(own) else np.nan), sums
 
 
-def _likelihoods(rival: Rival, candidate: Candidate) -> Callable[[Array], Array]:
-    """The log-likelihoods (n,) of a record (J, p) at all draws; -inf where there is none."""
-    system, filter, theta = candidate.system, rival.filter, rival.theta
+def _likelihoods(rival: Rival, candidate: Candidate) -> Callable[[Array, Array], Array]:
+    """The log-likelihoods (n,) at theta (n, k) of a record (J, p); -inf where there is none."""
+    system, filter = candidate.system, rival.filter
     if isinstance(filter, DifferentiableFilter):
         evaluate = evaluator(LogLikelihood(system, filter, POINTS))
     else:
@@ -129,7 +139,7 @@ def _likelihoods(rival: Rival, candidate: Candidate) -> Callable[[Array], Array]
         def evaluate(points: Array, *record: object) -> tuple[Array]:
             return (np.array([alone(point, *record)[0] for point in points]),)
 
-    def found(observed: Array) -> Array:
+    def found(theta: Array, observed: Array) -> Array:
         terms = evaluate(
             theta, candidate.steps, observed, candidate.inputs, candidate.t0, _ANY_SEED
         )[0]

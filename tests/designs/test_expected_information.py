@@ -161,6 +161,34 @@ def test_weights_of_models_are_those_before_the_record():
     assert found["decided"].item() == pytest.approx(by_model.item())
 
 
+def two_parts(sd, dependent=False):
+    """The gain as a sum of two normals, of which the second has this sd."""
+    with pm.Model() as built:
+        first = pm.Normal("first")
+        second = pm.Normal("second", first if dependent else 0, sd)
+        params = {"gain": first + second}
+        psf.StateSpace("d", SYSTEM, psf.EKF(), params=params, steps=[1], inputs=[0.0])
+    return built
+
+
+def test_information_about_some_parameters_alone():
+    own = {name: DESIGNS[name] for name in ("pushed", "pulse")}
+    settings = FEW | {"n_records": 200, "n_draws": 400}
+    found = psf.expected_information(two_parts(0.5), own, var_names=["first"], **settings)
+    for name, design in own.items():
+        true = truth(design, np.sqrt(1.25)) - truth(design, 0.5)
+        row = found.loc[name]
+        assert row["low"] - 3 * row["low_se"] < true < row["high"] + 3 * row["high_se"]
+        assert row["high"] - row["low"] < 0.3
+    assert found.sentences[0] == "Ranked by the expected information about first, in nats."
+    pair = {"a": two_parts(0.5), "b": two_parts(1.0)}
+    of_two = psf.expected_information(pair, own, var_names=["first"], **settings)
+    columns = ["parameters_low[a]", "parameters_high[a]"]
+    np.testing.assert_array_equal(
+        of_two.loc[list(own), columns], found.loc[list(own), ["low", "high"]]
+    )
+
+
 def draws(n=2000, sd=0.2, seed=1, correlation=0.95):
     """Draws of a normal gain that are autocorrelated."""
     rng = np.random.default_rng(seed)
@@ -187,9 +215,9 @@ def test_information_near_the_number_of_draws_is_called_a_lower_bound():
     wide = psf.expected_information(model(sd=1e3), {"pushed": DESIGNS["pushed"]}, **FEW)
     assert wide["low"].item() < np.log(60) + 1e-9
     assert wide.sentences[1] == (
-        "With 'pushed' the information about the parameters is near the log of the number of "
-        "draws, 4.1, above which it is not seen: there low is a lower bound, and the others are "
-        "not reliable; more n_draws would show more."
+        "With 'pushed' information about the parameters may be above what the draws can show, the "
+        "log of their number, 4.1: there low is a lower bound, and the others are not reliable; "
+        "more n_draws would show more."
     )
 
 
@@ -369,6 +397,23 @@ def test_models_of_which_no_record_is_one():
     refused(
         "models: draws of the prior leave out the potentials ['more']: give draws as idata=",
         models=doubted,
+    )
+
+
+def test_parameters_that_are_not_there_or_not_independent():
+    refused(
+        "models: var_names must be a list of some of ['gain'], got ['slope']", var_names=["slope"]
+    )
+    refused(
+        "models: var_names must be independent of the other variables in the prior, got ['first'] "
+        "beside ['second']: name those, too",
+        models=two_parts(1.0, dependent=True),
+        var_names=["first"],
+    )
+    refused(
+        "models: var_names must be None with idata, whose draws are dependent",
+        idata=draws(),
+        var_names=["gain"],
     )
 
 

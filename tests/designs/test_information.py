@@ -111,6 +111,31 @@ def _z(found, true):
     return (one.value - true) / one.se
 
 
+def test_information_about_one_parameter_of_two():
+    """Given the first, the other one is noise that all rows have in common."""
+    x = DESIGNS[2]
+    cov, given = x @ x.T + SD**2 * np.eye(len(x)), x[:, 1:] @ x[:, 1:].T + SD**2 * np.eye(len(x))
+    true, z = (np.linalg.slogdet(cov)[1] - np.linalg.slogdet(given)[1]) / 2, []
+    for seed in SEEDS:
+        whole = records([x], seed, [N])
+        theta = np.random.default_rng([seed, 0]).normal(size=(N, 2))
+        mixed = np.empty((1, R, 1, G))
+        y = theta[:R] @ x.T + noise(seed, 0, R)[:, : len(x)]
+        for r in range(R):
+            means = np.column_stack([np.full(N, theta[r, 0]), theta[:, 1]]) @ x.T
+            found = log_likelihood(y[r], means)
+            assert found[r] == pytest.approx(whole.own[0, r])
+            found[r] = -np.inf
+            mixed[0, r, 0] = group_sums(found, G)
+        both = whole._replace(sums=np.concatenate([whole.sums, mixed], axis=2))
+        own = replicates(both, ONE, 20.0)
+        low, high = (own[f"parameters_{end}[0]"][0] for end in ("low", "high"))
+        assert low < high
+        z.append(_z(own["parameters[0]"], true))
+    assert 0.55 < np.mean(np.square(z)) < 1.6
+    assert abs(np.mean(z)) < 0.5
+
+
 def test_all_draws_and_those_without_a_group_are_those_of_the_formulas():
     """By matrices of all likelihoods, in one loop for each record."""
     n, n_records, n_groups = 43, 50, 20
