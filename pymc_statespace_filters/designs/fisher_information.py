@@ -21,6 +21,7 @@ from scipy.stats import rankdata
 from ..pymc_model.at_points import ConstrainedValues
 from ..pymc_model.elements import places_in_vector
 from ..pymc_model.inspection import state_space_nodes
+from ..pymc_model.posterior_draws import unconstraining
 from ..pymc_model.term_scores import ScoredVariable
 
 STEP = 1e-6  # of differences, in standard deviations of the prior
@@ -48,6 +49,7 @@ class Coordinates:
 
     def __init__(self, model: pm.Model) -> None:
         self._values, self._places = ConstrainedValues(model), places_in_vector(model)
+        self._unconstrained = unconstraining(model)
         k = sum(at.size for at in self._places.values())
         kinds = np.full(k, "unconstrained")
         with np.errstate(all="ignore"):
@@ -67,11 +69,22 @@ class Coordinates:
         y[:, self.kinds == "log"] = np.log(y[:, self.kinds == "log"])
         return y
 
+    def inverse(self, y: Array) -> Array:
+        """The points (m, k) that have these coordinates; not finite outside the support."""
+        x = np.where(self.kinds == "unconstrained", y, 0.0)
+        values = self._values(x)
+        for name, at in self._places.items():
+            own = y[:, at.ravel()]
+            if self.kinds[at.flat[0]] != "unconstrained":
+                own = np.where(self.kinds[at.ravel()] == "log", np.exp(own), own)
+                values[name] = own.reshape(values[name].shape)
+        return self._unconstrained(values)
+
     def jacobian(self, x: Array, sd: Array) -> Array:
-        """The derivatives (k, k) of the coordinates by the unconstrained vector at a point (k,)."""
-        moves = 1e-5 * np.diag(sd)
-        up, down = self(x + moves), self(x - moves)
-        return np.asarray((up - down).T / (2e-5 * sd))
+        """The derivatives (m, k, k) of the coordinates by the unconstrained vector at x (m, k)."""
+        moves, (m, k) = 1e-5 * np.diag(sd), x.shape
+        up, down = (self((x[:, None] + t * moves).reshape(-1, k)).reshape(m, k, k) for t in (1, -1))
+        return np.swapaxes((up - down) / (2e-5 * sd[:, None]), 1, 2)
 
 
 def spread(y: Array) -> Array:
@@ -156,6 +169,8 @@ def _row_scores(variable: ScoredVariable, observed: Array, x: Array, sd: Array) 
     # Those of the system's parameters that depend on x, with steps of their own.
     steps = STEP * np.sqrt(((jacobian * sd) ** 2).sum(axis=-1)).mean(axis=0)
     moving = np.flatnonzero(steps)
+    if not moving.size:
+        return np.zeros((*observed.shape[:2], len(x)))
     h = steps[moving]
     moves = np.zeros((2, len(moving), len(steps)))
     moves[:, np.arange(len(moving)), moving] = h, -h

@@ -9,13 +9,13 @@ from ..statistics.importance import largest_good_k, normalised, smoothed, system
 from ..statistics.student_mixture import StudentMixture, mixture_of
 from .fisher_information import Coordinates, Likelihood, spread
 
-N_DRAWS, N_ROUNDS = 2000, 8  # of importance samples, each with proposals fitted to the one before
-N_COMPONENTS = 8  # of proposals: a posterior may be a narrow, bent ridge
+N_DRAWS, N_ROUNDS = 2000, 6  # of importance samples, each with proposals fitted to the one before
+N_COMPONENTS = 4  # of proposals: a posterior may be bent
 WIDE = {2.0: 0.2}  # scales of further components, with their weights
 # Effective share of the draws that a sample has at least; and from which its tail may be any.
-LEAST, ENOUGH = 0.3, 0.5
+LEAST, ENOUGH = 0.2, 0.5
 N_NEWTON, N_HALVINGS, SETTLED = 20, 6, 1e-3  # SETTLED in nats
-STEP = 1e-4  # of differences of the prior, in standard deviations
+STEP = 1e-3  # of differences of the prior, in standard deviations of the posterior
 
 Array = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ class FullPosterior:
         start = model.initial_point()
         values = [model.rvs_to_values[rv] for rv in model.free_RVs]
         point = {value: start[value.name] for value in values}
-        self._log_prior = GraphsAtPoints(model, [model.logp(vars=model.free_RVs)], point)
+        self._log_density_of_x = GraphsAtPoints(model, [model.logp(vars=model.free_RVs)], point)
 
     def spread(self, x: Array, cov: Array, rng: np.random.Generator) -> Array | None:
         """Of the posterior of a record simulated at x (k,), by `spread` in the coordinates, (k,).
@@ -42,10 +42,8 @@ class FullPosterior:
         fails.
         """
         records = self._likelihood.record(x, rng)
-        inverse = np.linalg.inv(self._coordinates.jacobian(x, self._sd))
-        own = inverse @ cov @ inverse.T
-        mode = self._mode(x, own, records)
-        proposal = StudentMixture(np.ones(1), mode[None], np.linalg.cholesky(own)[None])
+        mode = self._mode(self._coordinates(x[None])[0], cov, records)
+        proposal = StudentMixture(np.ones(1), mode[None], np.linalg.cholesky(cov)[None])
         for _ in range(N_ROUNDS):
             proposal = proposal.with_wide_parts(WIDE)
             draws = proposal.sample(N_DRAWS, rng)
@@ -58,33 +56,49 @@ class FullPosterior:
             draws = draws[systematic(weights, N_DRAWS, rng)]
             if share > (LEAST if pareto_k <= largest_good_k(N_DRAWS) else ENOUGH):
                 self._likelihood.on_progress(1)
-                return spread(self._coordinates(draws))
+                return spread(draws)
             fitted = mixture_of(draws, N_COMPONENTS, rng)
             if fitted is None:
                 return None
             proposal = fitted
         return None
 
-    def _log_density(self, x: Array, records: list[Array]) -> Array:
-        """The log-density (m,) of the posterior at x (m, k), -inf where there is none."""
-        with np.errstate(all="ignore"):
-            found = self._log_prior(x)[0] + self._likelihood.values(x, records)
-        return np.where(np.isnan(found), -np.inf, found)
+    def _log_density(self, y: Array, records: list[Array]) -> Array:
+        """The log-density (m,) of the posterior at coordinates y (m, k), -inf outside."""
+        found = self._log_prior(y)
+        inside = np.isfinite(found)
+        if inside.any():
+            x = self._coordinates.inverse(y[inside])
+            found[inside] += self._likelihood.values(x, records)
+        return found
 
-    def _mode(self, x: Array, cov: Array, records: list[Array]) -> Array:
-        """The mode (k,), by steps from x with the expected covariance, which climb."""
-        value = self._log_density(x[None], records)[0]
+    def _log_prior(self, y: Array) -> Array:
+        with np.errstate(all="ignore"):
+            x = self._coordinates.inverse(y)
+            (found,) = self._log_density_of_x(x)
+            found = found - np.linalg.slogdet(self._coordinates.jacobian(x, self._sd))[1]
+        return np.where(np.isfinite(found), found, -np.inf)
+
+    def _mode(self, y: Array, cov: Array, records: list[Array]) -> Array:
+        """The mode (k,), by steps from y with the expected covariance, which climb."""
+        value = self._log_density(y[None], records)[0]
         for _ in range(N_NEWTON):
-            step = cov @ (self._likelihood.gradient(x, records) + self._prior_gradient(x))
-            tried = x + step / 2.0 ** np.arange(N_HALVINGS)[:, None]
+            step = cov @ (self._slope(y, records) + self._prior_slope(y, cov))
+            tried = y + step / 2.0 ** np.arange(N_HALVINGS)[:, None]
             values = self._log_density(tried, records)
             best = int(values.argmax())
             if not values[best] > value + SETTLED:
                 break
-            x, value = tried[best], values[best]
-        return x
+            y, value = tried[best], values[best]
+        return y
 
-    def _prior_gradient(self, x: Array) -> Array:
-        moves = STEP * np.diag(self._sd)
-        up, down = (self._log_prior(x + sign * moves)[0] for sign in (1, -1))
-        return np.asarray((up - down) / (2 * STEP * self._sd))
+    def _slope(self, y: Array, records: list[Array]) -> Array:
+        """The gradient (k,) of the log-likelihood by the coordinates."""
+        x = self._coordinates.inverse(y[None])
+        (jacobian,) = self._coordinates.jacobian(x, self._sd)
+        return np.linalg.solve(jacobian.T, self._likelihood.gradient(x[0], records))
+
+    def _prior_slope(self, y: Array, cov: Array) -> Array:
+        h = STEP * np.sqrt(np.diagonal(cov))
+        up, down = (self._log_prior(y + sign * np.diag(h)) for sign in (1, -1))
+        return np.asarray((up - down) / (2 * h))

@@ -226,7 +226,7 @@ def identifiability(
         for i, point in enumerate(x):
             information = likelihood.information(point, n_records, rng)
             if information is not None:
-                inverse = np.linalg.inv(coordinates.jacobian(point, sd))
+                inverse = np.linalg.inv(coordinates.jacobian(point[None], sd)[0])
                 covs.append(expected_posterior(cov, inverse.T @ information @ inverse))
                 kept.append(i)
         if len(kept) < LEAST_LEFT * len(x):

@@ -4,7 +4,7 @@ The unconstrained space is that of the model's value variables: every free varia
 and vectors and matrices are flattened.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import pymc as pm
@@ -179,6 +179,12 @@ def unconstrained(
     """Points (n, k) from values (n, ...) of all free variables; of some of them, if so ``chosen``.
 
     What lies outside the support is not finite.
+    """
+    return unconstraining(model)(values, chosen)
+
+
+def unconstraining(model: pm.Model) -> Callable:
+    """The function `unconstrained` of values and chosen variables of a model.
 
     PyMC's ``unconstrain_values`` hands DataArrays to operations that need arrays, such as that of
     `LKJCorr`.
@@ -191,14 +197,21 @@ def unconstrained(
         graphs.append(symbol if transform is None else transform.forward(symbol, *rv.owner.inputs))
     graphs = graph_replace(graphs, dict(zip(free, symbols, strict=True)), strict=False)
     batches, results = at_points(symbols, graphs)
-    # A single call for all draws does not repay compilation to machine code.
+    # Calls are too few to repay compilation to machine code.
     function = pytensor.function(batches, results, mode="FAST_COMPILE", on_unused_input="ignore")
-    arrays = [
-        values[rv.name].astype(batch.type.dtype) for rv, batch in zip(free, batches, strict=True)
-    ]
-    found = dict(zip(free, function(*arrays), strict=True))
-    columns = [found[rv].reshape(len(arrays[0]), -1) for rv in chosen or free]
-    return np.concatenate(columns, axis=1).astype(np.float64)
+
+    def at(
+        values: Mapping[str, np.ndarray], chosen: Sequence[TensorVariable] = ()
+    ) -> NDArray[np.float64]:
+        arrays = [
+            values[rv.name].astype(batch.type.dtype)
+            for rv, batch in zip(free, batches, strict=True)
+        ]
+        found = dict(zip(free, function(*arrays), strict=True))
+        columns = [found[rv].reshape(len(arrays[0]), -1) for rv in chosen or free]
+        return np.concatenate(columns, axis=1).astype(np.float64)
+
+    return at
 
 
 def _completed(posterior: xr.Dataset, model: pm.Model) -> xr.Dataset:

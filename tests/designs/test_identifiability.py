@@ -197,8 +197,50 @@ def test_coordinates_follow_the_support():
     x = np.array([[0.3, -0.4, 0.1, 0.2]])
     s = 1 / (1 + np.exp(-x[0]))
     np.testing.assert_allclose(coordinates(x)[0], [np.log(3 * s[0]), 2 * s[1] - 1, 0.1, 0.2])
+    np.testing.assert_allclose(coordinates.inverse(coordinates(x)), x)
     right = [1 - s[0], 2 * s[1] * (1 - s[1]), 1.0, 1.0]
-    np.testing.assert_allclose(coordinates.jacobian(x[0], np.ones(4)), np.diag(right), atol=1e-8)
+    np.testing.assert_allclose(coordinates.jacobian(x, np.ones(4))[0], np.diag(right), atol=1e-8)
+
+
+def test_full_posteriors_are_priors_where_the_data_say_nothing():
+    """Whatever the transform, and however skew the prior."""
+    with pm.Model() as model:
+        pm.Uniform("uniform", 0, 3)
+        pm.Uniform("both", -1, 1)
+        pm.HalfNormal("half", 1)
+        pm.Dirichlet("shares", np.ones(3))
+        psf.StateSpace("d", line(), psf.EKF(), params=dict(a=0, b=0, c=0), steps=[0], inputs=U)
+    found = psf.identifiability(model, n_draws=6, random_seed=1, progressbar=False)
+    np.testing.assert_allclose(found["ratio"], 1.0, atol=1e-6)
+    np.testing.assert_allclose(found["full_ratio"], 1.0, atol=0.06)
+    assert found.sentences[1:] == (
+        "The data say nothing of uniform, both, half, shares[0] and shares[1].",
+    )
+
+
+def test_width_of_a_population_needs_full_posteriors():
+    """Its prior with the levels is not normal: their widths depend on it, they are independent."""
+    system = psf.StateSpaceModel(
+        transition=lambda x: [x[0]],
+        observation=lambda x, level: [x[0] + level],
+        observation_noise=[[1e-4]],
+        initial_mean=[0.0],
+        initial_cov=0.0,
+    )
+    with pm.Model() as model:
+        tau = pm.LogNormal("tau", 0, 0.7)
+        pm.Normal("level", 0, tau, shape=5)
+        psf.StateSpace("d", system, psf.EKF(), steps=[0] * 5, panel=range(5))
+    found = psf.identifiability(model, var_names="tau", random_seed=1, progressbar=False)
+    # That of five normal variables of unknown scale, with its prior.
+    right = (1 / 0.7**2 + 2 * 5) ** -0.5 / 0.7
+    assert found["ratio"]["tau"] > 0.95
+    assert found["full_ratio"]["tau"] == pytest.approx(right, rel=0.12)
+    assert len(found.sentences) == 2
+    assert found.sentences[1].startswith(
+        "The posteriors are not normal: by full posteriors of 6 simulated records the ratio is of "
+        "tau 0."
+    )
 
 
 def test_heavy_tails_do_not_count():
