@@ -90,7 +90,7 @@ def replicates(records: Records, weights: Array, odds: float) -> dict[str, Array
         If i is true: the probability that its posterior odds against all others together are above
         ``odds``, and that those of a wrong model are. Without index, over all models.
 
-    ``parameters[i]`` and ``model`` are in the middle between their bounds.
+    ``parameters[i]`` and ``model`` are in the middle between low and high.
     """
     with np.errstate(invalid="ignore"):
         return dict(_quantities(records, weights, odds))
@@ -186,14 +186,16 @@ def _mean(values: Array, kept: Array) -> Array:
 
 
 def _between(name: str, low: Array, high: Array, index: str = "") -> Iterator[tuple[str, Array]]:
-    yield f"{name}{index}", (low + high) / 2
+    # Above, without a bound where all other draws exclude a record, low is what is known.
+    yield f"{name}{index}", np.where(np.isposinf(high), low, (low + high) / 2)
     yield f"{name}_low{index}", low
     yield f"{name}_high{index}", high
 
 
 def best_first(replicated: Mapping[str, Array]) -> tuple[list[str], dict[str, Estimate]]:
     """Names in the order of their values, and the difference of each from the first."""
-    order = sorted(replicated, key=lambda name: -replicated[name][0])
+    values = {name: own[0] for name, own in replicated.items()}
+    order = sorted(values, key=lambda name: (np.isnan(values[name]), -values[name]))
     first = replicated[order[0]]
     with np.errstate(invalid="ignore"):
         return order, {name: estimate(replicated[name] - first) for name in order}

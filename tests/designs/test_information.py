@@ -233,6 +233,20 @@ def test_information_far_above_the_draws_ends_at_their_number():
     assert np.isfinite(estimate(found["parameters[0]"])).all()
 
 
+def test_a_record_that_all_other_draws_exclude_has_no_upper_bound():
+    whole = records([DESIGNS[5]], 1)
+    sums = whole.sums.copy()
+    sums[0, 3] = -np.inf
+    found = replicates(whole._replace(sums=sums), ONE, 20.0)
+    assert found["parameters_high[0]"][0] == np.inf
+    assert found["parameters[0]"][0] == found["parameters_low[0]"][0] < np.log(N)
+    order, differences = best_first(
+        {"none": np.full(G + 3, np.nan), "one": found["parameters_low[0]"]}
+    )
+    assert order == ["one", "none"]
+    assert np.isnan(differences["none"].value)
+
+
 def test_best_first():
     a, b = np.r_[1.0, np.linspace(0.9, 1.1, 4), 1, 1], np.r_[2.0, np.linspace(1.8, 2.2, 4), 1, 1]
     order, differences = best_first({"a": a, "b": b})
