@@ -164,11 +164,11 @@ def _reshaped(op: Reshape, node: Apply, inputs: Sequence[Any], point: Mapping) -
     if status is None or inputs[1] is not None or status.axis != 0 or not op.ndim:
         return None
     lengths = [node.inputs[0].shape[0], node.outputs[0].shape[0]]
-    before, after = _evaluated(lengths, point)
+    before, after = evaluated(lengths, point)
     return status if before == after else None
 
 
-def _evaluated(graphs: Sequence[Variable], point: Mapping) -> list[Any]:
+def evaluated(graphs: Sequence[Variable], point: Mapping) -> list[Any]:
     """Numbers of graphs at a point; few, so not worth machine code."""
     values = [v for v in dict.fromkeys(graph_inputs(graphs)) if v.name in point]
     function = pytensor.function(values, list(graphs), mode="FAST_COMPILE")
@@ -247,5 +247,5 @@ def _likelihood_of_panel(
 
 def records_of_rows(rows: Variable) -> np.ndarray:
     """The number of the record of each row of a panel, (J,), from its current rows."""
-    codes = _evaluated([rows], {})[0][:, RECORD]
+    codes = evaluated([rows], {})[0][:, RECORD]
     return np.concatenate([[0], np.cumsum(codes[1:] != codes[:-1])])

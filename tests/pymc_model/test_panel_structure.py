@@ -1,11 +1,13 @@
 """Which parameters of a panel belong to single records, for models of many forms.
 
-In each form the four graphs add up to the model's log-density, and own terms of a record do not
-change with the own parameters of another one.
+In each form the four graphs add up to the model's log-density, with the Jacobian of the coordinates
+that random effects have, and own terms of a record do not change with the own parameters of another
+one.
 """
 
 import numpy as np
 import pymc as pm
+import pytensor
 import pytensor.tensor as pt
 import pytest
 
@@ -47,6 +49,72 @@ def centred():
 def non_centred():
     mu, sd = pm.Normal("mu"), pm.HalfNormal("sd")
     panel(rate=mu + sd * pm.Normal("z", dims="machine"), level=0.5)
+
+
+def factors():
+    """Random effects as factors, in the units of clinical tables."""
+    typical, omega = pm.LogNormal("typical"), pm.HalfNormal("omega")
+    z = pm.Normal("z", dims="machine")
+    of_weight = np.array([1.0, 2.0, 0.5]) ** 0.75
+    level = pm.Deterministic("of_each", typical * of_weight / pm.math.exp(omega * z))
+    panel(rate=0.3, level=level)
+
+
+def around_zero():
+    """The effects have the variance of the population, and not its mean."""
+    typical, omega = pm.LogNormal("typical"), pm.HalfNormal("omega")
+    z = pm.Normal("z", 0.0, omega, dims="machine")
+    panel(rate=0.3, level=typical * pm.math.exp(z))
+
+
+def columns():
+    """Each column of the effects enters a parameter of its own."""
+    mu, sd = pm.Normal("mu", shape=2), pm.HalfNormal("sd", shape=2)
+    z = pm.Normal("z", shape=(3, 2))
+    panel(rate=pm.math.tanh(mu[0] - sd[0] * z[:, 0]), level=(mu[1] - z[:, 1]) / sd[1])
+
+
+def table():
+    """The effects of two parameters by one formula, with a mean for every machine."""
+    mu, sd = pm.Normal("mu", shape=2), pm.HalfNormal("sd", shape=2)
+    x = mu + np.arange(3.0)[:, None] + sd * pm.Normal("z", shape=(3, 2))
+    panel(rate=pm.math.tanh(x[:, 0]), level=x[:, 1])
+
+
+def two_effects():
+    mu, sd = pm.Normal("mu"), pm.HalfNormal("sd")
+    level = 2.0 * mu + pm.Normal("w", dims="machine")
+    panel(rate=pm.math.tanh(mu + sd * pm.Normal("z", dims="machine")), level=level)
+
+
+def factor_of_any_sign():
+    """Only the spread is a parameter of the population: a negative factor has no logarithm."""
+    typical, omega = pm.Normal("typical"), pm.HalfNormal("omega")
+    z = pm.Normal("z", dims="machine")
+    panel(rate=0.3, level=typical * pm.math.exp(omega * z))
+
+
+def mean_used_twice():
+    mu, sd = pm.Normal("mu"), pm.HalfNormal("sd")
+    panel(rate=pm.math.tanh(mu + sd * pm.Normal("z", dims="machine")), level=mu)
+
+
+def effect_used_twice():
+    mu, sd = pm.Normal("mu"), pm.HalfNormal("sd")
+    z = pm.Normal("z", dims="machine")
+    panel(rate=pm.math.tanh(mu + sd * z), level=z)
+
+
+def squared_effect():
+    mu, sd = pm.Normal("mu"), pm.HalfNormal("sd")
+    panel(rate=0.3, level=mu + sd * pm.Normal("z", dims="machine") ** 2)
+
+
+def effect_of_each_column():
+    """Three columns of one effect: their numbers are more than those of the effect."""
+    mu, sd = pm.Normal("mu"), pm.HalfNormal("sd", shape=3)
+    x = mu + sd * pm.Normal("z", shape=(3, 1))
+    panel(rate=0.3, level=x.sum(axis=1))
 
 
 def population_of_shared():
@@ -124,7 +192,17 @@ def as_data():
 
 FORMS = {  # own, population, shared
     centred: (["x"], ["mu", "sd"], ["level"]),
-    non_centred: (["z"], [], ["mu", "sd"]),
+    non_centred: (["z"], ["mu", "sd"], []),
+    factors: (["z"], ["typical", "omega"], []),
+    around_zero: (["z"], ["typical", "omega"], []),
+    columns: (["z"], ["mu", "sd"], []),
+    table: (["z"], ["mu", "sd"], []),
+    two_effects: (["z", "w"], ["mu", "sd"], []),
+    factor_of_any_sign: (["z"], ["omega"], ["typical"]),
+    mean_used_twice: (["z"], ["sd"], ["mu"]),
+    effect_used_twice: (["z"], [], ["mu", "sd"]),
+    squared_effect: (["z"], [], ["mu", "sd"]),
+    effect_of_each_column: (["z"], [], ["mu", "sd"]),
     population_of_shared: (["x"], ["tau"], ["level"]),
     bounded_by_population: (["x"], [], ["top"]),
     correlated: (["x"], ["chol"], []),
@@ -164,7 +242,8 @@ def check_terms(model, found):
         graphs.append(found.other_likelihood)
     # Too few calls to be worth machine code.
     whole = model.compile_fn(model.logp(), mode=AS_IT_STANDS)
-    terms = model.compile_fn(graphs, mode=AS_IT_STANDS, on_unused_input="ignore")
+    centred = {one.value: one.centred for one in found.centrings}
+    terms = function_of([centred.get(value, value) for value in model.value_vars], graphs)
     rng = np.random.default_rng(1)
     point = {
         name: value + 0.2 * rng.normal(size=np.shape(value))
@@ -172,7 +251,8 @@ def check_terms(model, found):
     }
     before = terms(point)
     total = sum(np.sum(part) for part in before)
-    np.testing.assert_allclose(total, whole(point), rtol=1e-10)
+    in_model, log_jacobian = point_in_model(model, found.centrings, point)
+    np.testing.assert_allclose(total - log_jacobian, whole(in_model), rtol=1e-12)
     for value in found.own:
         moved = dict(point) | {value.name: point[value.name].copy()}
         moved[value.name][1] += 0.1
@@ -186,6 +266,24 @@ def check_terms(model, found):
         after = terms(dict(point) | {value.name: point[value.name] + 0.1})
         changes[value.name] = bool((np.asarray(before[0]) != np.asarray(after[0])).any())
     assert not any(changes[value.name] for value in found.population)
+
+
+def function_of(values, graphs):
+    """The graphs as a function of a point, whose values these are."""
+    function = pytensor.function(values, graphs, mode=AS_IT_STANDS, on_unused_input="ignore")
+    return lambda point: function(*(point[value.name] for value in values))
+
+
+def point_in_model(model, centrings, point):
+    """The point in the coordinates of the model, and the log-Jacobian of those by differences."""
+    values = [one.replaced[one.value] for one in centrings]
+    centred = {one.value: one.centred for one in centrings}
+    backward = function_of([centred.get(value, value) for value in model.value_vars], values)
+    names, log_jacobian = [one.value.name for one in centrings], 0.0
+    found, moved = (backward(point | {n: point[n] + up for n in names}) for up in (0.0, 1.0))
+    for before, after in zip(found, moved, strict=True):
+        log_jacobian += np.log(np.abs(after - before)).sum()
+    return point | dict(zip(names, found, strict=True)), log_jacobian
 
 
 def sum_to_zero():

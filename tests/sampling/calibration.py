@@ -185,7 +185,9 @@ class Replications:
         if setting.graph:
             self._target = Target(self.model, None, settings, graph=setting.graph(self.model))
         else:
-            self._target = target_of(self.model, settings, None, None, has_pilot=False)
+            self._target = target_of(
+                self.model, settings, None, None, has_pilot=False, centres=True
+            )
         self._deterministics = Deterministics(self.model, self._target.raveled)
         # Machine code runs in threads; what PyTensor has compiled is called by one at a time.
         self._lock = Lock()

@@ -97,10 +97,47 @@ def test_exact_posterior(filter, centred):
     stats = idata["sample_stats"]
     assert stats["record_accepted"].dims == ("chain", "draw", "d_record")
     assert stats["d_record"].values.tolist() == LABELS
-    assert ("shared_accepted" in stats, "population_accepted" in stats) == (
-        not centred,
-        centred,
-    )
+    # The non-centred form is moved in centred coordinates.
+    assert ("shared_accepted" in stats, "population_accepted" in stats) == (False, True)
+
+
+@pytest.mark.parametrize("filter", [psf.EKF(), NOISY], ids=["EKF", "BootstrapPF"])
+def test_a_spread_of_random_effects_by_quadrature(filter):
+    """Twelve comparisons at 4.5 standard errors, two cases: one false alarm in 6000 seeds."""
+    labels = ["a", "b", "c", "d"]
+    with pm.Model(coords={"place": labels}) as model:
+        mu, sd = pm.Normal("mu", 0.0, PRIOR_SD), pm.HalfNormal("sd", 1.0)
+        z = pm.Normal("z", dims="place")
+        psf.StateSpace(
+            "d",
+            SYSTEM,
+            filter,
+            panel=np.repeat(labels, N_ROWS),
+            steps=np.tile(np.arange(1, N_ROWS + 1), len(labels)),
+            observed=data_of(len(labels)),
+            params={"level": mu + sd * z},
+        )
+    posterior = chains(model, 3000)["posterior"]
+    expected = of_random_effects(data_of(len(labels)).reshape(-1, N_ROWS).mean(axis=1))
+    drawn = [posterior["mu"].values, posterior["sd"].values]
+    drawn += [drawn[0] ** 2, drawn[1] ** 2, *np.moveaxis(posterior["z"].values, -1, 0)]
+    for draws, mean in zip(drawn, expected, strict=True):
+        assert abs(draws.mean() - mean) < 4.5 * az.mcse(draws, method="mean")
+
+
+def of_random_effects(means):
+    """E mu, E sd, E mu^2, E sd^2 and E z of each record, from the means of their rows."""
+    sd = np.linspace(1e-4, 6.0, 20001)
+    variance = sd**2 + (PROCESS_VAR + MEASUREMENT_VAR) / N_ROWS
+    precision = PRIOR_SD**-2 + len(means) / variance
+    mu = means.sum() / variance / precision
+    squares = (means**2).sum() / variance - precision * mu**2
+    log_weights = -0.5 * (len(means) * np.log(variance) + np.log(precision) + squares + sd**2)
+    weights = np.exp(log_weights - log_weights.max())
+    weights /= weights.sum()
+    z = sd / variance * (means[:, None] - mu)
+    numbers = np.array([mu, sd, mu**2 + 1.0 / precision, sd**2, *z])
+    return numbers @ weights
 
 
 def test_held_noise_has_the_error_of_its_seed():
@@ -111,16 +148,17 @@ def test_held_noise_has_the_error_of_its_seed():
     assert worst_deviation(idata) > 6.0
 
 
-def test_the_estimate_of_each_draw_is_that_of_its_seeds():
+@pytest.mark.parametrize("centred", [True, False], ids=["centred", "non_centred"])
+def test_the_estimate_of_each_draw_is_that_of_its_seeds(centred):
     """A record's kept estimate is the filter's at its level with its seed."""
-    model = panel_model(NOISY)
+    model = panel_model(NOISY, centred=centred)
     idata = chains(model, 40, 40, chains=1)
     posterior, stats = idata["posterior"].isel(chain=0), idata["sample_stats"].isel(chain=0)
     prior = model.compile_fn(model.logp(vars=model.free_RVs), mode=AS_IT_STANDS)
     data = data_of(3).reshape(3, N_ROWS)
     for draw in (0, 20, 39):
         levels = posterior["level"].values[draw]
-        total = prior({"mu": posterior["mu"].values[draw], "level": levels})
+        total = prior({rv.name: posterior[rv.name].values[draw] for rv in model.free_RVs})
         for g, label in enumerate(LABELS):
             terms = psf.log_likelihood(
                 SYSTEM,

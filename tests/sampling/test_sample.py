@@ -223,17 +223,24 @@ def test_the_choice():
     assert kinked == "the equations of 'd' have kinks or jumps"
 
 
-@pytest.fixture(scope="module", params=["noise", "records"])
+@pytest.fixture(scope="module", params=["noise", "records", "records_by_given_cov"])
 def two_parts(request, tmp_path_factory):
-    """A run in one piece, and in two with a file between them."""
+    """A run in one piece, and in two with a file between them.
+
+    Records have centred coordinates, but those of the model if the covariance is given.
+    """
     from tests.sampling.test_record_chains import panel_model
 
-    model = {
-        "records": lambda: panel_model(psf.EKF()),
-        "noise": lambda: state_space_model(psf.BootstrapPF(20)),
-    }[request.param]()
+    if request.param == "noise":
+        model = state_space_model(psf.BootstrapPF(20))
+    else:
+        model = panel_model(psf.EKF(), centred=False)
     call = {"model": model, "chains": 2, "progressbar": False}
-    whole, first = (psf.sample_dram(n, 60, thin=2, random_seed=3, **call) for n in (70, 30))
+    cov = 0.1 * np.eye(4) if "given" in request.param else None
+    given = {"kernel": {"proposal_cov": cov}}
+    whole, first = (
+        psf.sample_dram(n, 60, thin=2, random_seed=3, **call, **given) for n in (70, 30)
+    )
     path = tmp_path_factory.mktemp("draws") / "first.nc"
     first.to_netcdf(path)
     read = xr.open_datatree(path).load()

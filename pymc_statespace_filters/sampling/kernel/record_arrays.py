@@ -1,7 +1,8 @@
 """Arrays and evaluations of a chain that moves the records of a panel one by one: `record_moves`.
 
 A position has three blocks: the own parameters of every record, the shared ones, and those of the
-population. `ChainState` and `Draws` have the same arrays as for other chains, with more columns:
+population. In a state some own parameters have centred coordinates, in draws those of the model.
+`ChainState` and `Draws` have the same arrays as for other chains, with more columns:
 the numbers of a state have the kept estimates behind the others, the counts of a draw have what
 each block has accepted.
 """
@@ -12,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...compiler.native.entry_point import njit_cached
-from ...compiler.native.jit import linked
+from ...compiler.native.jit import copy_into, linked
 from ...compiler.native.pytensor_function import Call, make_call
 from ...filters.outcomes import NOT_A_NUMBER, RAISED
 from .adaptation_state import pack, packed_size, start_adaptation, unpack
@@ -31,7 +32,8 @@ FIRST_ESTIMATE = 3
 FIRST_ACCEPTED = N_COUNTS
 # Moves of the population in an iteration: without a likelihood they cost next to nothing.
 N_POPULATION_MOVES = 10
-# Evaluations of an iteration, each with noise of its own: of the records, of the shared block.
+# Evaluations of an iteration, each with noise of its own: of the records, of the shared block, and
+# of the interwoven one if there is any.
 N_NOISES = 2
 
 
@@ -40,7 +42,8 @@ class NativeRecordDensities(NamedTuple):
 
     # G likelihoods of the records, that of other data, and the health of each filter.
     likelihood: Call
-    prior: Call  # G terms of the records, and all other terms
+    # G terms of the records, all other terms, and locations and scales of the centred places.
+    prior: Call
     position: np.ndarray  # (d,)
     seeds: np.ndarray  # int64 (noisy,), of an evaluation
     n_healths: int
@@ -52,6 +55,8 @@ class RecordLayout(NamedTuple):
     own: np.ndarray  # int64 (G, k): places of a record's own parameters
     shared: np.ndarray  # int64 (s,)
     population: np.ndarray  # int64 (p,)
+    centred: np.ndarray  # int64 (c,): places where a state has location + scale * value
+    interwoven: np.ndarray  # int64 (i,): of what locations and scales are made; of other blocks too
     # int64 (G, panels): places of the seeds of a record's estimate in those of a state
     seeds: np.ndarray
     # int64: for every seed of a state, the column of the seeds of an evaluation
@@ -63,8 +68,12 @@ class RecordLayout(NamedTuple):
         return len(self.own)
 
     def blocks(self) -> list[np.ndarray]:
-        """Places of each block: those of every record, then the shared one and the population."""
-        return [*self.own, self.shared, self.population]
+        """Places of each block: those of every record, then the shared one and the population.
+
+        The last is the interwoven one, if there is any.
+        """
+        interwoven = [self.interwoven] if self.interwoven.size else []
+        return [*self.own, self.shared, self.population, *interwoven]
 
     def first_adaptation(self, cov: np.ndarray) -> np.ndarray:
         """Packed states of the adaptation of every block, one after the other.
@@ -79,7 +88,7 @@ class RecordLayout(NamedTuple):
 
     def proposal_variances(self, packed: np.ndarray) -> np.ndarray:
         """Variances of the proposals of every parameter, (d,), from the packed states."""
-        variances = np.empty(sum(map(len, self.blocks())))
+        variances = np.empty(len(np.unique(np.concatenate(self.blocks()))))
         for block, part in self._adaptations(packed):
             variances[block] = np.diag(unpack(part, len(block)).cov)
         return variances
@@ -100,8 +109,10 @@ class RecordRandomBlock(NamedTuple):
     own: np.ndarray  # (iterations, G, k), normals for the proposals
     shared: np.ndarray  # (iterations, s)
     population: np.ndarray  # (iterations, N_POPULATION_MOVES, p)
-    log_uniforms: np.ndarray  # (iterations, G + 1 + N_POPULATION_MOVES), to accept
-    seeds: np.ndarray  # int64 (iterations, N_NOISES, noisy)
+    interwoven: np.ndarray  # (iterations, i)
+    # (iterations, G + 1 + N_POPULATION_MOVES), to accept; one more for the interwoven block
+    log_uniforms: np.ndarray
+    seeds: np.ndarray  # int64 (iterations, N_NOISES, noisy); one more for the interwoven block
 
 
 def record_random_block(
@@ -109,13 +120,15 @@ def record_random_block(
 ) -> RecordRandomBlock:
     """Draw a chain's random numbers for iterations ``index * BLOCK`` to ``(index + 1) * BLOCK``."""
     rng = generator_of_block(key, index)
-    n_uniforms = layout.n_records + 1 + N_POPULATION_MOVES
+    n_more = 1 if layout.interwoven.size else 0
+    n_uniforms = layout.n_records + 1 + N_POPULATION_MOVES + n_more
     return RecordRandomBlock(
         rng.standard_normal((BLOCK, *layout.own.shape)),
         rng.standard_normal((BLOCK, len(layout.shared))),
         rng.standard_normal((BLOCK, N_POPULATION_MOVES, len(layout.population))),
+        rng.standard_normal((BLOCK, len(layout.interwoven))),
         -rng.standard_exponential((BLOCK, n_uniforms)),
-        draw_seeds(rng, (BLOCK, N_NOISES, n_noisy)),
+        draw_seeds(rng, (BLOCK, N_NOISES + n_more, n_noisy)),
     )
 
 
@@ -167,3 +180,43 @@ def evaluate_priors(density, priors):
         return False
     _take_numbers(priors, density.prior.out)
     return True
+
+
+@njit_cached
+def write_in_model(density, layout, state, position):
+    """Write the position of a state in the coordinates of the model.
+
+    Returns the log-Jacobian of those of the state; NaN if the model raised.
+    """
+    copy_into(position, state.position)
+    n = layout.centred.size
+    if n == 0:
+        return 0.0
+    copy_into(density.position, state.position)
+    if not make_call(density.prior):
+        return np.nan
+    first, log_jacobian = 1 + layout.own.shape[0] + 1, 0.0
+    for i in range(n):
+        place, scale = layout.centred[i], density.prior.out[first + n + i]
+        position[place] = (state.position[place] - density.prior.out[first + i]) / scale
+        log_jacobian -= np.log(np.abs(scale))
+    return log_jacobian
+
+
+@njit_cached
+def centre(density, layout):
+    """Give the position in the arrays, one of the model, the coordinates of a state, in place.
+
+    Returns as `write_in_model`. Locations and scales depend on no centred place.
+    """
+    n = layout.centred.size
+    if n == 0:
+        return 0.0
+    if not make_call(density.prior):
+        return np.nan
+    first, log_jacobian = 1 + layout.own.shape[0] + 1, 0.0
+    for i in range(n):
+        place, scale = layout.centred[i], density.prior.out[first + n + i]
+        density.position[place] = density.prior.out[first + i] + scale * density.position[place]
+        log_jacobian -= np.log(np.abs(scale))
+    return log_jacobian

@@ -5,8 +5,8 @@ constant::
 
     pi(m, s) prod_g p(x_g | m, s) L_g(x_g, s)
 
-Given m and s the records are independent. An iteration is therefore made of three moves, each of
-which keeps this distribution:
+Given m and s the records are independent. An iteration is therefore made of moves each of which
+keeps this distribution:
 
 * All records propose at once, each by its own random walk, and one evaluation gives new estimates
   of all L_g. Record g accepts with probability min(1, p(z_g) L_g(z_g) / (p(x_g) L_g(x_g))) and then
@@ -15,6 +15,13 @@ which keeps this distribution:
 * The shared block is proposed, all L_g are estimated with fresh noise, and their product decides.
 * The population makes several moves, accepted by the densities of the own parameters alone. No
   likelihood depends on it.
+
+Where the likelihoods depend on c_g = a + b x_g, with a and b functions of m and s, these moves are
+those of c_g, whose density has the factor 1 / |b|; draws are recorded as x_g. They mix well if the
+data of each record say more about c_g than the population does. If they say less, x_g is nearly
+independent of a and b, and c_g is not. So there is a fourth move, of the same posterior: what a and
+b are made of is proposed at the same x_g, which changes all L_g, as the shared block does. Chains
+that move in the one and the other coordinates in turn mix about as well as in the better ones.
 
 Every estimate belongs to the point at which it was made, and is kept until its record moves or the
 shared block does. The noise of the records is independent, so that each move is one of Andrieu and
@@ -25,6 +32,9 @@ References
 ----------
 C. Andrieu and G. O. Roberts (2009). The pseudo-marginal approach for efficient Monte Carlo
 computations. Annals of Statistics 37, 697-725.
+Y. Yu and X.-L. Meng (2011). To center or not to center: that is not the question - an
+ancillarity-sufficiency interweaving strategy (ASIS) for boosting MCMC efficiency. Journal of
+Computational and Graphical Statistics 20, 531-570.
 """
 
 import numpy as np
@@ -35,7 +45,14 @@ from ...filters.outcomes import RAISED
 from .adaptation import learn
 from .adaptation_state import packed_size, unpack
 from .delayed_rejection import log_ratio_to_one
-from .record_arrays import FIRST_ACCEPTED, FIRST_ESTIMATE, evaluate_likelihoods, evaluate_priors
+from .record_arrays import (
+    FIRST_ACCEPTED,
+    FIRST_ESTIMATE,
+    centre,
+    evaluate_likelihoods,
+    evaluate_priors,
+    write_in_model,
+)
 from .state import (
     ACCEPTANCE,
     FAILURE,
@@ -198,6 +215,41 @@ def _move_shared(settings, density, layout, state, random, k, terms, counts):
 
 
 @_internal
+def _move_interwoven(settings, density, layout, state, random, k, terms, counts):
+    """What locations and scales are made of moves at the same values of the model."""
+    estimates, priors, new_estimates, new_priors = terms
+    n_records, block = layout.own.shape[0], layout.interwoven
+    first = state.adaptation.size - packed_size(block.size)
+    adaptation = unpack(state.adaptation[first:], block.size)
+    in_model = np.empty(state.position.size)
+    jacobian = write_in_model(density, layout, state, in_model)
+    _propose(state, density, block, adaptation.chol, random.interwoven[k])
+    _take_block(density.position, in_model, layout.centred)
+    new_jacobian = centre(density, layout)
+    copy_into(density.seeds, random.seeds[k, -1])
+    found = evaluate_likelihoods(density, new_estimates)
+    _count(counts, found, n_records)
+    if found.failure == RAISED or not evaluate_priors(density, new_priors):
+        counts[FAILURE] = RAISED
+        return
+    here = _total(estimates, priors) - jacobian
+    there = _total(new_estimates, new_priors) - new_jacobian
+    is_possible = there > -np.inf  # not NaN, as of a scale beyond all numbers
+    accepted = is_possible and random.log_uniforms[k, -1] < log_ratio_to_one(there, here)
+    if accepted:
+        copy_into(estimates, new_estimates)
+        copy_into(priors, new_priors)
+        copy_into(state.position, density.position)
+        for place in range(state.seeds.size):
+            state.seeds[place] = density.seeds[layout.columns[place]]
+        counts[STAGE] = 1
+    else:
+        copy_into(density.position, state.position)
+    if settings.adapts:
+        _learn(settings, adaptation, state, block, 1 if accepted else 0)
+
+
+@_internal
 def _move_population(settings, density, layout, state, random, k, terms, counts):
     """Several moves of the population, which evaluate no likelihood."""
     estimates, priors, _, new_priors = terms
@@ -258,12 +310,14 @@ def advance_records(settings, density, layout, state, random, first, draws, row,
         acceptance = _move_records(settings, density, layout, state, random, k, terms, counts)
         if counts[FAILURE] != RAISED and layout.shared.size > 0:
             _move_shared(settings, density, layout, state, random, k, terms, counts)
+        if counts[FAILURE] != RAISED and layout.interwoven.size > 0:
+            _move_interwoven(settings, density, layout, state, random, k, terms, counts)
         if counts[FAILURE] != RAISED and layout.population.size > 0:
             _move_population(settings, density, layout, state, random, k, terms, counts)
         if counts[FAILURE] == RAISED:
             break
-        state.numbers[LOG_DENSITY] = _total(estimates, priors)
-        copy_into(draws.positions[at], state.position)
+        log_jacobian = write_in_model(density, layout, state, draws.positions[at])
+        state.numbers[LOG_DENSITY] = _total(estimates, priors) - log_jacobian
         copy_into(draws.seeds[at], state.seeds)
         numbers[LOG_DENSITY] = state.numbers[LOG_DENSITY]
         numbers[N_EFFECTIVE] = state.numbers[N_EFFECTIVE]

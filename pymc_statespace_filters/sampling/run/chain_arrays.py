@@ -83,6 +83,11 @@ class ChainArrays:
         # Counts of the row that was not full when the draws were last saved.
         self._saved_counts = np.zeros(n_counts, dtype=np.int64)
 
+    @property
+    def position(self) -> np.ndarray:
+        """Where the chain is, in the coordinates of the model."""
+        return self.state.position
+
     def compile(self) -> None:
         """Compile the iterations, or load them from disk, without making one."""
         with slow_compilation("the random walk"):

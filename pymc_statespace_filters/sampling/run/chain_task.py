@@ -172,9 +172,8 @@ class ChainTask:
         """Find a start; for each evaluation made, 0 or its failure code."""
         failures = self.chain.start(self.candidates(self.rng), (), self.rng)
         if self.measures_noise:
-            state = self.chain.state
             seeds = draw_seeds(self.rng, (N_SEEDS, len(self.target.seed_names)))
-            spread = self.chain.seed_spread(state.position, seeds)
+            spread = self.chain.seed_spread(self.chain.position, seeds)
             self._noisy_start = NoisyStart(self.target.model, self.index, spread)
         return failures
 

@@ -31,6 +31,7 @@ class FormerChains(NamedTuple):
     states: list[ChainState]
     iterations: int
     thin: int
+    is_centred: bool  # whether states may have other coordinates than the model
     positions: list[np.ndarray]
 
     def digest(self) -> str:
@@ -47,6 +48,7 @@ def stored_states(
     iterations: int,
     draws: int,
     thin: int,
+    is_centred: bool,
     settings: RandomWalkSettings,
 ) -> DataTree | None:
     """The group of the states of chains; None if they cannot go on from it.
@@ -71,6 +73,7 @@ def stored_states(
         "iterations": int(iterations),
         "draws": int(draws),
         "thin": int(thin),
+        "is_centred": int(is_centred),
         "kernel": repr(settings),
         "model": fingerprint,
         "data": model_data_fingerprint(model),
@@ -117,7 +120,8 @@ def former_chains(
             f"got {n_draws}: select from the result"
         )
     positions = list(unconstrained_draws(idata, model))
-    return FormerChains(states, int(group.attrs["iterations"]), int(group.attrs["thin"]), positions)
+    iterations, thin = int(group.attrs["iterations"]), int(group.attrs["thin"])
+    return FormerChains(states, iterations, thin, bool(group.attrs.get("is_centred")), positions)
 
 
 def _check(group: xr.Dataset, model: Model, settings: RandomWalkSettings, chains: int) -> None:

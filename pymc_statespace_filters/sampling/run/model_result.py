@@ -145,5 +145,6 @@ def _stored_states(task: "ModelTask", results: Results) -> DataTree | None:
         iterations=task.n_iterations + (0 if former is None else former.iterations),
         draws=task.length.draws + (0 if former is None else len(former.positions[0])),
         thin=task.length.thin,
+        is_centred=request.is_centred,
         settings=request.settings,
     )

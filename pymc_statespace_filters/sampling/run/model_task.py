@@ -103,6 +103,7 @@ class ModelTask:
                 request.proposal_cov,
                 self._group,
                 has_pilot=request.pilot is not None,
+                centres=request.is_centred,
             )
             self._target = target
             target.prepare()

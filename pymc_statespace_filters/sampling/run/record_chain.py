@@ -13,6 +13,7 @@ from ..kernel.record_arrays import (
     FIRST_ESTIMATE,
     RecordEvaluation,
     RecordRandomBlock,
+    write_in_model,
 )
 from ..kernel.record_moves import advance_records
 from ..kernel.state import (
@@ -111,6 +112,8 @@ class RecordChain(ChainArrays):
             What the model raised.
         """
         failures: list[int] = []
+        layout = self._target.layout
+        candidates = [self._densities.centred(position, layout) for position in candidates]
 
         def evaluate(position: np.ndarray) -> _Terms:
             self._check_pause()
@@ -138,6 +141,13 @@ class RecordChain(ChainArrays):
         priors = self._densities.priors(self.state.position)
         self.state.numbers[LOG_DENSITY] = self._estimates.sum() + priors.sum()
         return tuple(failures)
+
+    @property
+    def position(self) -> np.ndarray:
+        """Where the chain is, in the coordinates of the model."""
+        position = np.empty_like(self.state.position)
+        write_in_model(self._densities.native, self._target.layout, self.state, position)
+        return position
 
     @property
     def _estimates(self) -> np.ndarray:
@@ -171,6 +181,7 @@ class RecordChain(ChainArrays):
     def seed_spread(self, position: np.ndarray, seeds: np.ndarray) -> SeedSpread:
         """Measure the spread of each record's estimates over seeds (R, noisy); the widest one."""
         estimates = []
+        position = self._densities.centred(position, self._target.layout)
         for row in seeds:
             self._check_pause()
             estimates.append(self._densities.estimate(position, row)[0][:-1])

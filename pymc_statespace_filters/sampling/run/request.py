@@ -68,6 +68,14 @@ class SamplingRequest(NamedTuple):
         """Iterations of warm-up that are not kept."""
         return 0 if self.keeps_warmup else self.tune
 
+    @property
+    def is_centred(self) -> bool:
+        """Whether chains may move records in other coordinates than those of the model.
+
+        A given covariance is one in the latter.
+        """
+        return self.proposal_cov is None if self.former is None else self.former.is_centred
+
     def with_former(self, positions: Mapping[int, np.ndarray]) -> list[np.ndarray]:
         """Draws of some chains, by their numbers, each behind those that it is to go on from."""
         if self.former is None:

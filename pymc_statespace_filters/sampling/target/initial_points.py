@@ -101,11 +101,15 @@ class StartDraws:
         return np.diag(self.variances()) * 2.38**2 / self._default.size
 
     def variances(self) -> np.ndarray:
-        """Variances of the draws, 1 where that is not a positive number, shape (d,)."""
-        dim = self._default.size
-        variance = self.draws.var(axis=0) if len(self.draws) > 1 else np.ones(dim)
-        variance[~(np.isfinite(variance) & (variance > 0.0))] = 1.0
-        return variance
+        """Variances of the draws, as `variances_of`, shape (d,)."""
+        return variances_of(self.draws)
+
+
+def variances_of(draws: np.ndarray) -> np.ndarray:
+    """Variances of draws (n, d), 1 where that is not a positive number, shape (d,)."""
+    variances = draws.var(axis=0) if len(draws) > 1 else np.ones(draws.shape[1])
+    variances[~(np.isfinite(variances) & (variances > 0.0))] = 1.0
+    return variances
 
 
 def best_initial_point(

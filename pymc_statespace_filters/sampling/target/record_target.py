@@ -2,11 +2,13 @@
 
 The log-density takes two calls of machine code. One estimates the likelihoods of all records. The
 other gives the terms without a likelihood, which takes microseconds: the moves of the population
-evaluate it alone.
+evaluate it alone. Both take positions in the coordinates of the structure, in which some own
+parameters are centred.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import pytensor.tensor as pt
@@ -27,11 +29,13 @@ from ..kernel.record_arrays import (
     RecordEvaluation,
     RecordLayout,
     RecordRandomBlock,
+    centre,
     evaluate_likelihoods,
     evaluate_priors,
     record_random_block,
 )
 from ..kernel.state import ChainState
+from .initial_points import variances_of
 from .sampled_model import Growth, SampledModel
 from .settings import RandomWalkSettings, checked_proposal_cov
 from .target import Target
@@ -45,7 +49,7 @@ class RecordDensities:
     model : pymc.Model
     structure : PanelStructure
     variables : sequence of TensorVariable
-        All value variables, in the order of the vector into which they are raveled.
+        All value variables of the model, in the order of the vector into which they are raveled.
     point : mapping of str to ndarray
         Any point of the model.
     seeds : mapping of str to shared variable
@@ -60,6 +64,10 @@ class RecordDensities:
         point: Mapping[str, np.ndarray],
         seeds: Mapping[str, TensorVariable],
     ):
+        centrings = {one.value: one for one in structure.centrings}
+        variables = [centrings[v].centred if v in centrings else v for v in variables]
+        locations = [one.location for one in structure.centrings]
+        scales = [one.scale for one in structure.centrings]
         other = structure.other_likelihood
         likelihoods = [structure.likelihood, pt.zeros(()) if other is None else other]
         healths = health_outputs(likelihoods)
@@ -67,7 +75,9 @@ class RecordDensities:
         self._likelihood, self._start = compile_raveled(
             point, [*likelihoods, *healths], variables, seeds
         )
-        self._prior, _ = compile_raveled(point, [structure.prior, structure.rest], variables)
+        self._prior, _ = compile_raveled(
+            point, [structure.prior, structure.rest, *locations, *scales], variables
+        )
         self._n_seeds = len(seeds)
         self._native: tuple[NativeFunction, NativeFunction] | None = None
 
@@ -135,6 +145,15 @@ class BoundRecordDensities:
             self.raise_error()
         return priors
 
+    def centred(self, position: np.ndarray, layout: RecordLayout) -> np.ndarray:
+        """A position of the model in the coordinates of these densities; an exception is raised."""
+        self.native.position[:] = position
+        with held_interrupts():
+            log_jacobian = centre(self.native, layout)
+        if np.isnan(log_jacobian):
+            self.raise_error()
+        return self.native.position.copy()
+
 
 def _inputs(position: np.ndarray, seeds: np.ndarray) -> list[np.ndarray]:
     """Arguments of the compiled functions; each seed is a view of the vector."""
@@ -162,8 +181,6 @@ class RecordTarget(SampledModel):
         Of the records.
     densities : RecordDensities
     layout : RecordLayout
-    first_adaptation : ndarray
-        Packed states of the adaptation of all blocks.
 
     Raises
     ------
@@ -185,12 +202,11 @@ class RecordTarget(SampledModel):
         self.structure = structure
         self.labels = tuple(model.coords[f"{structure.name}_record"])
         self.layout = self._layout(model)
-        first = self._first_variances()
+        self._proposal_cov = None
         if proposal_cov is not None:
-            first = checked_proposal_cov(proposal_cov, self.raveled.dim)
+            self._proposal_cov = checked_proposal_cov(proposal_cov, self.raveled.dim)
             if of_all:
-                first *= self.raveled.dim / self._block_sizes()
-        self.first_adaptation = self.layout.first_adaptation(first)
+                self._proposal_cov *= self.raveled.dim / self._block_sizes()
         self.densities = RecordDensities(
             model, structure, self.raveled.variables, self._default, self._seeds
         )
@@ -212,6 +228,8 @@ class RecordTarget(SampledModel):
             np.concatenate([places[v.name].reshape(n_records, -1) for v in structure.own], axis=1),
             _joined([places[v.name] for v in structure.shared]),
             _joined([places[v.name] for v in structure.population]),
+            _joined([places[one.value.name] for one in structure.centrings]),
+            _joined([places[v.name] for v in structure.interwoven]),
             np.ascontiguousarray(seeds),
             np.array(columns, dtype=np.int64),
         )
@@ -224,7 +242,8 @@ class RecordTarget(SampledModel):
     def evaluation(self) -> Callable[[], object]:
         """A function that evaluates all records once, to measure what they cost."""
         bound = self.densities.bind()
-        start, seeds = bound.native.position.copy(), bound.native.seeds.copy()
+        start = bound.centred(bound.native.position.copy(), self.layout)
+        seeds = bound.native.seeds.copy()
         return lambda: bound.estimate(start, seeds)
 
     def variable_name(self, value: TensorVariable) -> str:
@@ -239,7 +258,13 @@ class RecordTarget(SampledModel):
     def growth(self, state: ChainState) -> Growth:
         """Compare a chain's proposals with draws from the prior."""
         variances = self.layout.proposal_variances(state.adaptation)
-        return self._growth(variances, self._first_variances())
+        return self._growth(variances, self._first_variances)
+
+    @cached_property
+    def first_adaptation(self) -> np.ndarray:
+        """Packed states of the adaptation of all blocks."""
+        first = self._first_variances if self._proposal_cov is None else self._proposal_cov
+        return self.layout.first_adaptation(first)
 
     def random_block(self, key: np.ndarray, index: int) -> RecordRandomBlock:
         """Draw a block of random numbers for a chain with this key."""
@@ -248,9 +273,14 @@ class RecordTarget(SampledModel):
             block.seeds[...] = self.fixed_seeds
         return block
 
+    @cached_property
     def _first_variances(self) -> np.ndarray:
         """Variances of the prior's draws times 2.38^2 over the dimension of the block."""
-        return self.prior_draws.variances() * 2.38**2 / self._block_sizes()
+        bound = self.densities.bind()
+        draws = self.prior_draws.draws.copy()
+        for draw in draws:
+            draw[:] = bound.centred(draw, self.layout)
+        return variances_of(draws) * 2.38**2 / self._block_sizes()
 
     def _block_sizes(self) -> np.ndarray:
         """The number of parameters in the block of each, (d,)."""
@@ -267,12 +297,14 @@ def target_of(
     group: Communicator | None,
     *,
     has_pilot: bool,
+    centres: bool,
 ) -> Target | RecordTarget:
     """The target of a panel whose records have parameters of their own, or of any other model.
 
-    Arguments as of `Target`; ``has_pilot`` is whether the covariance comes from one.
+    Arguments as of `Target` and `panel_structure`; ``has_pilot`` is whether the covariance comes
+    from a pilot.
     """
-    structure = panel_structure(model)
+    structure = panel_structure(model, centres=centres)
     if structure is None:
         return Target(model, None, settings, proposal_cov, group=group)
     if group is not None and group.size > 1:
