@@ -2,10 +2,9 @@
 
 from collections.abc import Iterable
 from math import ceil
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any
 
 import numpy as np
-import pandas as pd
 import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
@@ -20,7 +19,6 @@ from ..pymc_model.inspection import given_model
 from ..pymc_model.posterior_draws import unconstrained_draws
 from ..pymc_model.prior import ModelPrior
 from ..system.checks import check_count, check_random_seed
-from ..tables import SentenceTable
 from .dummy_data import with_dummy_data
 from .fisher_information import (
     Coordinates,
@@ -30,62 +28,14 @@ from .fisher_information import (
     spread,
 )
 from .full_posteriors import FullPosterior
-from .weak_directions import (
-    WEAK,
-    combination_label,
-    determined_combinations,
-    precision,
-    weak_directions,
-)
+from .identifiability_table import Expected, Identifiability, table_of
 
 N_PRIOR = 4000  # draws, for the covariance of the prior
 LEAST_ROWS, ROWS_OF_PARAMETER = 500, 50  # rows of all simulated records of a point
 LEAST_LEFT = 0.25  # share of the points that must have a likelihood
 N_FULL = 6  # full posteriors
-DIFFERENT = 1.25  # factor between two ratios from which a posterior is not normal
-NOTHING = 0.97  # ratio, from which a parameter is as uncertain as before
 
 Array = NDArray[np.float64]
-
-
-class Identifiability(SentenceTable):
-    """A DataFrame with a row for each parameter, and the weak directions.
-
-    Attributes
-    ----------
-    directions : pandas.DataFrame
-        A row for each direction in which half of the prior's sd or more remains, weakest first:
-        ``remains``, the share that does, and the part of each parameter in sds of its prior.
-    combinations : pandas.DataFrame
-        What is determined of parameters that are not determined alone: sd and ratio.
-    """
-
-    _metadata: ClassVar[list[str]] = ["sentences", "directions", "combinations"]
-    main_columns = ("ratio", "se", "q05", "q95", "coordinate", "prior_sd", "posterior_sd")
-
-    def __init__(
-        self,
-        data: Any = None,
-        *,
-        directions: pd.DataFrame,
-        combinations: pd.DataFrame,
-        **settings: Any,
-    ) -> None:
-        super().__init__(data, **settings)
-        self.directions, self.combinations = directions, combinations
-
-    def __copy__(self, deep: bool = False) -> Self:
-        return type(self)(
-            self.copy(deep),
-            directions=self.directions,
-            combinations=self.combinations,
-            sentences=self.sentences,
-        )
-
-    def _texts(self, name: str) -> list[str]:
-        if name == "coordinate":
-            return list(self[name])
-        return [f"{value:.2g}" if name.endswith("sd") else f"{value:.3f}" for value in self[name]]
 
 
 def identifiability(
@@ -202,6 +152,8 @@ def identifiability(
     """
     given = given_model(model)
     n_draws = check_count("n_draws", n_draws, 2)
+    if n_records is not None:
+        n_records = check_count("n_records", n_records, 1)
     rng = check_random_seed(random_seed)
     own = with_dummy_data(given)
     check_free_variables(own)
@@ -213,56 +165,42 @@ def identifiability(
         likelihood = Likelihood(own, sd)
         full = FullPosterior(own, likelihood, coordinates, sd)
     x = prior[:n_draws] if idata is None else _posterior_points(given, own, idata, n_draws)
-    k = len(sd)
-    rows = max(LEAST_ROWS, ROWS_OF_PARAMETER * k)
-    n_records = (
-        ceil(rows / likelihood.n_rows)
-        if n_records is None
-        else check_count("n_records", n_records, 1)
-    )
+    rows = max(LEAST_ROWS, ROWS_OF_PARAMETER * len(sd))
+    n_records = ceil(rows / likelihood.n_rows) if n_records is None else n_records
     cov, covs, kept = normal_covariance(coordinates(prior)), [], []
     with row_progress(likelihood, enabled=progressbar) as announce:
         announce("simulated records", len(x) * n_records)
-        for i, point in enumerate(x):
+        for point in x:
             information = likelihood.information(point, n_records, rng)
             if information is not None:
                 inverse = np.linalg.inv(coordinates.jacobian(point[None], sd)[0])
                 covs.append(expected_posterior(cov, inverse.T @ information @ inverse))
-                kept.append(i)
-        if len(kept) < LEAST_LEFT * len(x):
+                kept.append(point)
+        if len(kept) < max(2, LEAST_LEFT * len(x)):
             raise ModelError(
                 "simulated records must be finite and have a likelihood by the filter at a quarter "
                 f"of the points, got {len(kept)} of {len(x)}: give the model a prior with less "
                 "mass where its equations have no solution"
             )
         announce("full posteriors", N_FULL)
-        tried = range(min(N_FULL, len(kept)))
-        found = [full.spread(x[kept[i]], covs[i], rng) for i in tried]
-    passed = [i for i in tried if found[i] is not None]
-    full_sds = np.array([found[i] for i in passed]).reshape(-1, k)
-    expected = Expected(list(elements.labels), coordinates.kinds, cov, np.array(covs))
-    ratios = full_sds / np.sqrt(np.diagonal(cov))
-    left_out = len(x) - len(kept)
-    return _table(expected, chosen, ratios, passed, len(tried), left_out, idata is not None)
-
-
-class Expected(NamedTuple):
-    """The prior's covariance (k, k), and those of posteriors (m, k, k), in the coordinates."""
-
-    labels: list[str]
-    kinds: NDArray[np.str_]
-    prior: Array
-    covs: Array
-
-    @property
-    def sds(self) -> Array:
-        """Of the posteriors (m, k)."""
-        return np.sqrt(np.diagonal(self.covs, axis1=1, axis2=2))
-
-    @property
-    def ratios(self) -> Array:
-        """Sds of the posteriors over those of the prior (m, k)."""
-        return np.asarray(self.sds / np.sqrt(np.diagonal(self.prior)))
+        pairs = zip(kept[:N_FULL], covs, strict=False)
+        full_sds = [full.spread(point, one, rng) for point, one in pairs]
+    where = "prior" if idata is None else "posterior"
+    sentences = [
+        "ratio is the expected sd of the posterior over that of the prior, for records simulated "
+        f"at {len(kept)} draws of the {where}."
+    ]
+    if len(kept) < len(x):
+        sentences.append(
+            f"{len(x) - len(kept)} further draws are left out: records simulated there are not "
+            "finite, or have no likelihood by the filter."
+        )
+    known = {variable.name for variable in likelihood.variables}
+    others = [v.name for v in [*own.observed_RVs, *own.potentials] if v.name not in known]
+    if others:
+        sentences.append(f"Not used are other data and potentials of the model: {others}.")
+    expected = Expected(list(elements.labels), coordinates.kinds, cov, np.array(covs), full_sds)
+    return table_of(expected, chosen, sentences)
 
 
 def _chosen(elements: Elements, var_names: str | Iterable[str] | None) -> NDArray[np.int64]:
@@ -276,136 +214,7 @@ def _chosen(elements: Elements, var_names: str | Iterable[str] | None) -> NDArra
 
 
 def _posterior_points(model: pm.Model, own: pm.Model, idata: Any, n_draws: int) -> Array:
-    checked_model(model, idata)
+    checked_model(model, idata, any_filter=True)
     draws = unconstrained_draws(idata, own)
     draws = draws.reshape(-1, draws.shape[-1])
     return np.asarray(draws[np.linspace(0, len(draws) - 1, n_draws).astype(int)])
-
-
-def _table(
-    expected: Expected,
-    chosen: NDArray[np.int64],
-    full: Array,
-    passed: list[int],
-    n_full: int,
-    left_out: int,
-    at_fit: bool,
-) -> Identifiability:
-    """The table of the ``chosen`` parameters; ``full`` (n, k) are ratios at the points passed."""
-    ratios = expected.ratios
-    full_ratio = full.mean(axis=0) if passed else np.full(ratios.shape[1], np.nan)
-    q05, q95 = np.quantile(ratios, [0.05, 0.95], axis=0)
-    columns = {
-        "ratio": ratios.mean(axis=0),
-        "se": ratios.std(axis=0, ddof=1) / len(ratios) ** 0.5,
-        "q05": q05,
-        "q95": q95,
-        "coordinate": expected.kinds,
-        "prior_sd": np.sqrt(np.diagonal(expected.prior)),
-        "posterior_sd": expected.sds.mean(axis=0),
-        "full_ratio": full_ratio,
-    }
-    labels = expected.labels
-    table = pd.DataFrame(columns, index=pd.Index(labels, name="parameter")).iloc[chosen]
-    exponents, sd, ratio = determined_combinations(
-        expected.covs, expected.prior, expected.kinds, chosen
-    )
-    is_log = [bool((expected.kinds[row != 0] == "log").all()) for row in exponents]
-    names = [
-        combination_label(one, labels, is_log=log)
-        for one, log in zip(exponents, is_log, strict=True)
-    ]
-    combined = pd.DataFrame(
-        {"sd": sd, "ratio": ratio}, index=pd.Index(names, name="combination", dtype=object)
-    )
-    predicted = ratios[passed].mean(axis=0) if passed else ratios.mean(axis=0)
-    factor = np.maximum(full_ratio / predicted, predicted / full_ratio)
-    differs = [i for i in chosen if factor[i] > DIFFERENT]
-    sentences = [_head(len(ratios), left_out, at_fit)]
-    sentences += _of_combinations(table, exponents, combined, is_log, labels)
-    alone = [i for i in chosen if not exponents[:, i].any() and i not in differs]
-    sentences += _of_parameters(table.loc[[labels[i] for i in alone]])
-    sentences += _of_full(labels, differs, full_ratio, predicted, len(passed), n_full)
-    return Identifiability(
-        table,
-        directions=weak_directions(expected.covs, expected.prior, labels),
-        combinations=combined,
-        sentences=sentences,
-    )
-
-
-def _head(n_points: int, left_out: int, at_fit: bool) -> str:
-    where = "posterior" if at_fit else "prior"
-    text = (
-        f"ratio is the expected sd of the posterior over that of the prior, for records simulated "
-        f"at {n_points} draws of the {where}."
-    )
-    if not left_out:
-        return text
-    return (
-        f"{text} {left_out} further draws are left out: records simulated there are not finite, or "
-        "have no likelihood by the filter."
-    )
-
-
-def _of_combinations(
-    table: pd.DataFrame,
-    exponents: NDArray[np.int64],
-    combined: pd.DataFrame,
-    is_log: list[bool],
-    labels: list[str],
-) -> list[str]:
-    found = []
-    for row, (name, values), log in zip(exponents, combined.iterrows(), is_log, strict=True):
-        members = [labels[i] for i in np.flatnonzero(row)]
-        found.append(
-            f"{name} is determined {precision(values['sd'], is_log=log)}, {_listed(members)} alone "
-            f"are not: {_remain(table['ratio'][members])}."
-        )
-    return found
-
-
-def _of_parameters(table: pd.DataFrame) -> list[str]:
-    """What is said of parameters that are in no combination."""
-    found, ratio = [], table["ratio"]
-    if nothing := [str(name) for name in table.index[ratio >= NOTHING]]:
-        found.append(f"The data say nothing of {_listed(nothing)}.")
-    if little := [str(name) for name in table.index[(ratio >= WEAK) & (ratio < NOTHING)]]:
-        found.append(f"The data say little of {_listed(little)}: {_remain(ratio[little])}.")
-    return found
-
-
-def _remain(ratio: pd.Series) -> str:
-    shares = [f"{100 * value:.0f} %" for value in ratio]
-    if len(shares) == 1:
-        return f"{shares[0]} of its prior remains"
-    return f"{_listed(shares)} of their priors remain"
-
-
-def _of_full(
-    labels: list[str],
-    differs: list[int],
-    full: Array,
-    predicted: Array,
-    n_passed: int,
-    n_full: int,
-) -> list[str]:
-    found = []
-    if n_passed < n_full:
-        found.append(
-            f"The full posteriors of {n_full - n_passed} of {n_full} simulated records are so far "
-            "from normal that importance sampling failed: simulate some records, and sample their "
-            "posteriors."
-        )
-    if differs:
-        texts = [f"of {labels[i]} {full[i]:.2g} instead of {predicted[i]:.2g}" for i in differs]
-        found.append(
-            f"The posteriors are not normal: by full posteriors of {n_passed} simulated records "
-            f"the ratio is {_listed(texts)}."
-        )
-    return found
-
-
-def _listed(texts: list[str]) -> str:
-    *first, last = texts
-    return f"{', '.join(first)} and {last}" if first else last

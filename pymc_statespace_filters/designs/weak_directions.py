@@ -6,6 +6,7 @@ of others.
 
 from itertools import combinations, product
 from math import gcd
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -41,20 +42,24 @@ def weak_directions(covs: Array, prior: Array, labels: list[str]) -> pd.DataFram
     return table
 
 
+class Combinations(NamedTuple):
+    """Exponents (n, k) of combinations, their mean sds (n,) and ratios (n,), the best first."""
+
+    exponents: Exponents
+    sd: Array
+    ratio: Array
+
+
 def determined_combinations(
     covs: Array, prior: Array, kinds: NDArray[np.str_], chosen: NDArray[np.int64]
-) -> tuple[Exponents, Array, Array]:
-    """What the data determine of parameters that they do not determine one by one.
-
-    Returns exponents (n, k), and the mean sds and ratios (n,), of combinations of the ``chosen``
-    parameters, the best first.
-    """
+) -> Combinations:
+    """What the data determine of ``chosen`` parameters that they do not determine one by one."""
     ratio = _ratios(covs, prior, np.eye(len(prior), dtype=np.int64))[1]
     weak = chosen[(ratio[chosen] >= WEAK) & (kinds[chosen] != "unconstrained")]
     weak = weak[np.argsort(-ratio[weak], kind="stable")][:MOST_PARAMETERS]
     tried = _tried(weak, kinds)
     if not len(tried):
-        return tried, np.empty(0), np.empty(0)
+        return Combinations(tried, np.empty(0), np.empty(0))
     sd, ratios = _ratios(covs, prior, tried)
     members = np.where(tried != 0, ratio, np.inf).min(axis=1)
     good = [int(i) for i in np.flatnonzero(ratios < GAIN * members)]
@@ -66,7 +71,7 @@ def determined_combinations(
             break
         alike = [i for i in good if ratios[i] <= ALIKE * ratios[good].min()]
         picked.append(min(alike, key=lambda i: (np.abs(tried[i]).sum(), ratios[i])))
-    return tried[picked], sd[picked], ratios[picked]
+    return Combinations(tried[picked], sd[picked], ratios[picked])
 
 
 def _tried(weak: NDArray[np.int64], kinds: NDArray[np.str_]) -> Exponents:

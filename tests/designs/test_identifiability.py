@@ -209,11 +209,14 @@ def test_full_posteriors_are_priors_where_the_data_say_nothing():
         pm.Uniform("both", -1, 1)
         pm.HalfNormal("half", 1)
         pm.Dirichlet("shares", np.ones(3))
+        pm.Normal("y", model["both"], 1, observed=0.3)
+        pm.Potential("p", -model["half"])
         psf.StateSpace("d", line(), psf.EKF(), params=dict(a=0, b=0, c=0), steps=[0], inputs=U)
     found = psf.identifiability(model, n_draws=6, random_seed=1, progressbar=False)
     np.testing.assert_allclose(found["ratio"], 1.0, atol=1e-6)
     np.testing.assert_allclose(found["full_ratio"], 1.0, atol=0.06)
     assert found.sentences[1:] == (
+        "Not used are other data and potentials of the model: ['y', 'p'].",
         "The data say nothing of uniform, both, half, shares[0] and shares[1].",
     )
 
