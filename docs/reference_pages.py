@@ -84,6 +84,7 @@ GROUPS = {
         "smoothed_states",
         "forecast",
         "free_run",
+        "field",
         "filter_diagnostics",
         "diagnostics.drift_scan",
         "check_filter",
@@ -105,6 +106,7 @@ GROUPS = {
     "Before the experiment": ("expected_information", "identifiability"),
     "Plots": (
         "plot_states",
+        "plot_field",
         "plot_forecast",
         "plot_residuals",
         "plot_filter_health",

@@ -39,6 +39,7 @@ from .plots import (
     plot_designs,
     plot_drift,
     plot_evidence,
+    plot_field,
     plot_filter_health,
     plot_forecast,
     plot_model_probabilities,
@@ -58,7 +59,7 @@ from .sampling import (
     suggest_particles,
 )
 from .several_models import run_models
-from .states import filtered_states, forecast, free_run, smoothed_states
+from .states import field, filtered_states, forecast, free_run, smoothed_states
 from .system.drift_processes import OrnsteinUhlenbeck, RandomWalk
 from .system.drifting import drifting
 from .system.integrators import (
@@ -111,6 +112,7 @@ __all__ = [
     "estimate_evidence",
     "expected_information",
     "extend",
+    "field",
     "filter_diagnostics",
     "filtered_states",
     "find_starts",
@@ -129,6 +131,7 @@ __all__ = [
     "plot_designs",
     "plot_drift",
     "plot_evidence",
+    "plot_field",
     "plot_filter_health",
     "plot_forecast",
     "plot_model_probabilities",

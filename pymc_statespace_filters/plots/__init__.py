@@ -4,6 +4,7 @@ from .average import plot_average
 from .designs import plot_designs
 from .drift import plot_drift
 from .evidence import plot_evidence, plot_model_probabilities
+from .field import plot_field
 from .filter_health import plot_filter_health
 from .forecast import plot_forecast
 from .prequential import plot_prequential
@@ -17,6 +18,7 @@ __all__ = [
     "plot_designs",
     "plot_drift",
     "plot_evidence",
+    "plot_field",
     "plot_filter_health",
     "plot_forecast",
     "plot_model_probabilities",

@@ -66,6 +66,12 @@ def check_random_seed(random_seed: Any) -> np.random.Generator:
         ) from None
 
 
+def check_ci_prob(ci_prob: float) -> None:
+    """Raise a `ModelError` unless it is a probability."""
+    if not (isinstance(ci_prob, int | float) and 0 < ci_prob < 1):
+        raise ModelError(f"ci_prob must be a number between 0 and 1, got {ci_prob!r}")
+
+
 def check_floats(name: str, value: Any, ndim: int | None, *, missing: bool = False) -> np.ndarray:
     """Return ``value`` as an array of finite floats; with ``missing``, NaN may stand in it."""
     if np.ma.isMaskedArray(value):

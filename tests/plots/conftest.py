@@ -30,6 +30,27 @@ DESIGNS = pd.DataFrame(
     },
     index=pd.Index(["long", "short"], name="design"),
 )  # fmt: skip
+
+
+def a_field(mean, axes, visited):
+    """As of `field`."""
+    fields = {"mean": mean, "sd": 1 + abs(mean), "low": mean - 1, "high": mean + 1}
+    data = xr.Dataset(
+        {key: (tuple(axes), values) for key, values in fields.items()},
+        coords={**axes, "visited_state": list(axes)},
+        attrs={"ci_prob": 0.9},
+    )
+    return data.assign(visited=(("visit", "visited_state"), visited))
+
+
+V, W = np.linspace(-1, 1, 9), np.linspace(0, 2, 7)
+VISITS = np.random.default_rng(3).uniform([-0.5, 0.5], [0.5, 1.5], (600, 2))
+FIELDS = xr.DataTree.from_dict(
+    {
+        "c": a_field(V**3, {"v": V}, VISITS[:, :1]),
+        "e": a_field(np.outer(V, W), {"v": V, "w": W}, VISITS),
+    }
+)
 X = xr.DataArray(np.linspace(-2, 2, 9), coords=[("displacement", np.linspace(-2, 2, 9))])
 
 

@@ -11,6 +11,7 @@ from pymc_statespace_filters import (
     plot_designs,
     plot_drift,
     plot_evidence,
+    plot_field,
     plot_filter_health,
     plot_forecast,
     plot_model_probabilities,
@@ -19,7 +20,7 @@ from pymc_statespace_filters import (
     plot_states,
     plot_terms,
 )
-from tests.plots.conftest import DESIGNS, TERMS
+from tests.plots.conftest import DESIGNS, FIELDS, TERMS
 
 
 def run_free(idata, **settings):
@@ -53,6 +54,8 @@ PLOTS = [
     (in_bins, "replicated"),
     (plot_terms, "terms"),
     (plot_designs, "designs"),
+    (plot_field, "curve_of_field"),
+    (plot_field, "maps_of_field"),
 ]
 
 
@@ -71,6 +74,16 @@ def terms():
 @pytest.fixture(scope="session")
 def designs():
     return DESIGNS
+
+
+@pytest.fixture(scope="session")
+def curve_of_field():
+    return FIELDS.filter(lambda node: node.name != "e")
+
+
+@pytest.fixture(scope="session")
+def maps_of_field():
+    return FIELDS.filter(lambda node: node.name != "c")
 
 
 @pytest.fixture(scope="session")

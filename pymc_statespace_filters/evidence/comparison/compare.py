@@ -13,11 +13,12 @@ from scipy.stats import norm
 
 from ...errors import EvidenceWarning, ModelError
 from ...former_names import former_names
+from ...system.checks import check_ci_prob
 from ..evidence import Evidence
 from .by_row import compare_rows
 from .comparison_sentences import needs_warning, sentences, step_error_columns
 from .evidence_table import EvidenceTable
-from .selection import EvidenceLike, check_ci_prob, prior_weights, probabilities, select_evidences
+from .selection import EvidenceLike, prior_weights, probabilities, select_evidences
 
 # Kass and Raftery (1995), section 3.2: lower limits of twice the log Bayes factor.
 STRENGTHS = {0.0: "barely worth mentioning", 2.0: "positive", 6.0: "strong", 10.0: "very strong"}

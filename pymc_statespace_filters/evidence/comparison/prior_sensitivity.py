@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike
 
 from ...errors import EvidenceWarning, ModelError
 from ...pymc_model.posterior_draws import check_one_model, unconstrained_draws
+from ...system.checks import check_ci_prob
 from .compare import compare_evidence
 from .scaled_prior import ReweightedEvidence, ScaledPrior
-from .selection import EvidenceLike, check_ci_prob
+from .selection import EvidenceLike
 from .width_curves import curves_of_models, dataset_of_curves, width_factors
 
 MOSTLY = 0.5  # fraction of the widths other than 1 from which a curve is mostly unknown

@@ -68,12 +68,6 @@ def prior_weights(model_prior: Mapping[str, float] | None, names: list[str]) -> 
     return ratios / ratios.sum()
 
 
-def check_ci_prob(ci_prob: float) -> None:
-    """Raise a `ModelError` unless it is a probability."""
-    if not (isinstance(ci_prob, int | float) and 0 < ci_prob < 1):
-        raise ModelError(f"ci_prob must be a number between 0 and 1, got {ci_prob!r}")
-
-
 class Selection(NamedTuple):
     """One evidence for each model, and how it was chosen; empty without a choice."""
 

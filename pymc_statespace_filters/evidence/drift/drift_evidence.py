@@ -25,10 +25,10 @@ from ...statistics.importance import (
     log_mean_of_draws,
     pareto_k,
 )
-from ...system.checks import check_random_seed
+from ...system.checks import check_ci_prob, check_random_seed
 from ..checks import check_convergence
 from ..comparison.scaled_prior import UNCHANGED, UNKNOWN, ScaledPrior
-from ..comparison.selection import check_ci_prob, prior_weights, probabilities
+from ..comparison.selection import prior_weights, probabilities
 from ..comparison.width_curves import curves_of_models, dataset_of_curves, width_factors
 from ..posterior_of_draws import build_posterior, reproducing_seeds
 from .drift_table import DriftTable, sentences
