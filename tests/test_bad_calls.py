@@ -76,6 +76,15 @@ def variable(**arguments):
         return psf.StateSpace(**{"name": "d", "system": FREE, "filter": psf.EKF()} | arguments)
 
 
+def designs(**arguments):
+    with pm.Model() as built:
+        pm.Uniform("a", 0.0, 1.0)
+        psf.StateSpace("d", FREE, psf.EKF(), steps=[1])
+    given = {"models": built, "designs": {"x": {"steps": [1]}}} | arguments
+    return psf.expected_information(given.pop("models"), given.pop("designs"), **given)
+
+
+designs.__signature__ = inspect.signature(psf.expected_information)
 SHORT = {"draws": 2, "tune": 2, "chains": 1, "cores": 1, "progressbar": False}
 CALLS = {
     "UKF": (psf.UKF, {}),
@@ -94,6 +103,7 @@ CALLS = {
     "StateSpace": (variable, RECORD),
     "sample_dram": (with_model(psf.sample_dram), SHORT),
     "find_starts": (with_model(psf.find_starts), {"chains": 1, "progressbar": False}),
+    "expected_information": (designs, {"n_records": 20, "n_draws": 20, "progressbar": False}),
     "maximum_likelihood": (with_model(psf.maximum_likelihood), {}),
 }
 # Inherited from PyMC or meant for anything; handled by others.
@@ -111,6 +121,12 @@ MEANT = (
     }
     | {("nearest_steps", "dt", "a huge number"), ("sample_dram", "cores", "a huge number")}
     | {("sample_dram", "until_ess", value) for value in ("a fraction", "a huge number")}
+    | {
+        ("expected_information", argument, value)
+        for argument in ("odds", "target_se")
+        for value in ("a fraction", "a huge number")
+    }
+    | {("expected_information", "cores", "a huge number")}
     | {("StateSpace", "name", "a text"), ("sample_dram", "checkpoint", "a text")}
     | {(call, "dt", value) for call in CALLS for value in ("a fraction", "a huge number")}
     | {("EulerMaruyama", "diffusion", value) for value in NUMBERS}

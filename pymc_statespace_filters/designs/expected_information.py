@@ -22,6 +22,7 @@ from .rivals import FEWEST, named_models, read_rivals
 from .simulated_records import SimulatedRecords
 
 _MOST_GROUPS = 40  # of draws, each of which the jackknife leaves out once
+_MOST = 10**6  # draws, or records, which memory holds
 _MOST_TIMES = 16  # the number of records, for a target
 
 Array = NDArray[np.float64]
@@ -170,8 +171,8 @@ def expected_information(
     ['pushed', 'at rest']
     """
     named = named_models(models)
-    n_wanted = check_count("n_records", n_records, FEWEST)
-    check_count("n_draws", n_draws, FEWEST)
+    n_wanted = check_count("n_records", n_records, FEWEST, _MOST)
+    check_count("n_draws", n_draws, FEWEST, _MOST)
     if check_positive("odds", odds) < 1:
         raise ModelError(f"odds must be at least 1, got {odds!r}")
     target = None if target_se is None else check_positive("target_se", target_se)
