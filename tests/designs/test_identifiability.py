@@ -186,6 +186,17 @@ def test_records_of_a_panel_inform_their_own_levels():
     assert len(found.sentences) == 1
 
 
+def test_records_of_several_variables_add_up():
+    with pm.Model() as model:
+        pm.Normal("a", 0, 10)
+        for name, n_rows in {"first": 10, "second": 30}.items():
+            params, steps = {"b": 0.0, "c": 0.0}, range(n_rows)
+            psf.StateSpace(name, line(), psf.EKF(), params=params, steps=steps, inputs=U)
+    found = psf.identifiability(model, n_draws=20, random_seed=1, progressbar=False)
+    np.testing.assert_allclose(found["posterior_sd"], (0.01 + 40 / 0.25) ** -0.5, rtol=0.05)
+    np.testing.assert_allclose(found["full_ratio"], found["ratio"], rtol=0.1)
+
+
 def test_coordinates_follow_the_support():
     with pm.Model() as model:
         pm.Uniform("positive", 0, 3)
