@@ -70,6 +70,7 @@ def table_of(
         | _further(replicated[name], n_kept[name], list(rivals))
         | {f"n_records[{model}]": n for model, n in zip(rivals, n_kept[name], strict=True)}
         | {f"n_draws[{model}]": len(rival.theta) for model, rival in rivals.items()}
+        | {f"n_effective[{model}]": rival.n_effective for model, rival in rivals.items()}
         for name in order
     }
     data = pd.DataFrame.from_dict(rows, orient="index")
@@ -128,7 +129,7 @@ def _sentences(
         if len(rival.theta) < rival.n_given:
             yield (
                 f"{len(rival.theta)} of {rival.n_given} draws{_of(name, rivals)} are used, evenly "
-                "thinned: at most as many as independent draws would be worth the same."
+                f"thinned; all are worth {rival.n_effective} independent ones."
             )
     approximate = [name for name, rival in rivals.items() if not rival.is_exact]
     yield from approximation(approximate, len(rivals))
@@ -159,7 +160,8 @@ def _above_the_draws(table: pd.DataFrame, rivals: Mapping[str, Rival], about: st
         most = math.log(len(rival.theta))
         if not (near := list(table.index[(low > most - 1) | (high - low > 1)])):
             continue
-        remedy = "more n_draws" if len(rival.theta) == rival.n_given else "longer chains"
+        has_more = len(rival.theta) < rival.n_effective or rival.n_effective == rival.n_given
+        remedy = "more n_draws" if has_more else "longer chains"
         which = ", and about which model," if len(rivals) > 1 else ""
         yield (
             f"With {quoted(near)} information about {about}{_of(name, rivals)}{which} may be above "

@@ -116,8 +116,8 @@ def expected_information(
             Of several models: expected information about the parameters of model a, if it is true.
         ``log_bf[a, b]``
             Expected log Bayes factor of a against b, if a is true.
-        ``n_records[a]``, ``n_draws[a]``
-            Records that count, and draws.
+        ``n_records[a]``, ``n_draws[a]``, ``n_effective[a]``
+            Records that count, draws that are used, and the effective number of all draws.
 
         Columns with ``_se`` and ``_change`` before the bracket belong to these.
 

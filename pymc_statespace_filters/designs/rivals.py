@@ -30,7 +30,9 @@ Array = NDArray[np.float64]
 
 
 class Rival(NamedTuple):
-    """A model: theta (n, k) at independent draws, thinned from ``n_given`` if they were given.
+    """A model: theta (n, k) at draws of the prior, or at some of those that are given.
+
+    Of the latter there are ``n_given``, worth ``n_effective`` independent ones; else both are n.
 
     ``mixed`` (j) is theta (n, k) where the variables asked about have the values of draw j, and the
     others those of all draws; None where all are asked about.
@@ -40,6 +42,7 @@ class Rival(NamedTuple):
     filter: Filter
     theta: Array
     n_given: int
+    n_effective: int
     is_exact: bool
     mixed: Callable[[int], Array] | None
 
@@ -121,12 +124,12 @@ def _read(
     model = with_dummy_data(model)
     if idata is not None:
         model = checked_model(model, idata)
-    x, n_given = _draws(model, idata, n_draws, rng)
+    x, n_given, n_effective = _draws(model, idata, n_draws, rng)
     columns = None if var_names is None else _columns(model, idata, var_names)
     graph = state_space_nodes(model)[name].inputs[-5]
     if not model.free_RVs:
         theta = np.tile(graph.eval(mode="FAST_COMPILE"), (n_draws, 1))
-        return Rival(system, filter, theta, n_draws, exactness(model), None)
+        return Rival(system, filter, theta, n_given, n_effective, exactness(model), None)
     graphs = GraphsAtPoints(model, [graph])
 
     def theta_at(points: Array) -> Array:
@@ -138,15 +141,15 @@ def _read(
         return theta_at(points)
 
     own = None if columns is None else mixed
-    return Rival(system, filter, theta_at(x), n_given, exactness(model), own)
+    return Rival(system, filter, theta_at(x), n_given, n_effective, exactness(model), own)
 
 
 def _draws(
     model: pm.Model, idata: Any, n_draws: int, rng: np.random.Generator
-) -> tuple[Array, int]:
-    """Independent draws (n, k), and how many there were."""
+) -> tuple[Array, int, int]:
+    """Independent draws (n, k), how many there were, and how many independent ones they are."""
     if not model.free_RVs:
-        return np.zeros((n_draws, 0)), n_draws
+        return np.zeros((n_draws, 0)), n_draws, n_draws
     check_free_variables(model)
     if idata is not None:
         return _independent(unconstrained_draws(idata, model), n_draws, rng)
@@ -155,7 +158,7 @@ def _draws(
             f"draws of the prior leave out the potentials {[p.name for p in model.potentials]}: "
             "give draws as idata="
         )
-    return ModelPrior(model).sample(n_draws, rng), n_draws
+    return ModelPrior(model).sample(n_draws, rng), n_draws, n_draws
 
 
 def _columns(model: pm.Model, idata: Any, var_names: Sequence[str]) -> NDArray[np.int64]:
@@ -178,7 +181,7 @@ def _columns(model: pm.Model, idata: Any, var_names: Sequence[str]) -> NDArray[n
     return np.concatenate([places[rv.name].ravel() for rv in chosen])
 
 
-def _independent(draws: Array, n_draws: int, rng: np.random.Generator) -> tuple[Array, int]:
+def _independent(draws: Array, n_draws: int, rng: np.random.Generator) -> tuple[Array, int, int]:
     """Draws (chain, draw, k), evenly thinned to no more than their effective number, shuffled."""
     from arviz_stats.base import array_stats  # loads much: see `statistics.importance`
 
@@ -194,4 +197,4 @@ def _independent(draws: Array, n_draws: int, rng: np.random.Generator) -> tuple[
             f"worth {n_effective} (the smallest bulk effective sample size): sample longer"
         )
     chosen = np.linspace(0, len(below) - 1, min(n_draws, n_effective)).round().astype(int)
-    return below[rng.permutation(chosen)], len(below)
+    return below[rng.permutation(chosen)], len(below), n_effective

@@ -206,8 +206,7 @@ def test_draws_of_a_posterior_take_the_place_of_the_prior():
     n = found["n_draws[model]"].item()
     assert 50 < n < 200  # of 4000, with an autocorrelation time of 39
     assert found.sentences[1] == (
-        f"{n} of 4000 draws are used, evenly thinned: at most as many as independent draws would "
-        "be worth the same."
+        f"{n} of 4000 draws are used, evenly thinned; all are worth {n} independent ones."
     )
 
 
