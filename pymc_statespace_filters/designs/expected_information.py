@@ -62,8 +62,8 @@ def expected_information(
         ``sensors``, a list of observables, by default all. All models take the same arguments. Give
         ``times`` where their steps differ.
     idata : xarray.DataTree or mapping of str to xarray.DataTree, optional
-        Posterior draws of the model, or of each; by default draws of the priors. The new record
-        starts afresh, from the initial state of the system.
+        Posterior draws of the model, or of each, by its filter or another one; by default draws of
+        the priors. The new record starts afresh, from the initial state of the system.
     n_records : int
         Number of records that each model simulates of each design, at least 20.
     n_draws : int

@@ -121,15 +121,15 @@ def _read(
             f"score_from of {name!r} must be 0, as a new record begins at the start, got "
             f"{node.op.score_from}"
         )
-    model = with_dummy_data(model)
+    model, is_exact = with_dummy_data(model), exactness(model)
     if idata is not None:
-        model = checked_model(model, idata)
+        model = checked_model(model, idata, any_filter=True)
     x, n_given, n_effective = _draws(model, idata, n_draws, rng)
     columns = None if var_names is None else _columns(model, idata, var_names)
     graph = state_space_nodes(model)[name].inputs[-5]
     if not model.free_RVs:
         theta = np.tile(graph.eval(mode="FAST_COMPILE"), (n_draws, 1))
-        return Rival(system, filter, theta, n_given, n_effective, exactness(model), None)
+        return Rival(system, filter, theta, n_given, n_effective, is_exact, None)
     graphs = GraphsAtPoints(model, [graph])
 
     def theta_at(points: Array) -> Array:
@@ -141,7 +141,7 @@ def _read(
         return theta_at(points)
 
     own = None if columns is None else mixed
-    return Rival(system, filter, theta_at(x), n_given, n_effective, exactness(model), own)
+    return Rival(system, filter, theta_at(x), n_given, n_effective, is_exact, own)
 
 
 def _draws(

@@ -210,6 +210,15 @@ def test_draws_of_a_posterior_take_the_place_of_the_prior():
     )
 
 
+def test_draws_may_be_those_by_another_filter():
+    """As by particles, whose likelihood is not repeatable."""
+    own, idata = {"pushed": DESIGNS["pushed"]}, draws()
+    by_particles = idata.copy()
+    by_particles.attrs["filter"] = '{"d": "EnKF(50)"}'
+    found = psf.expected_information(model(), own, idata=by_particles, **FEW)
+    assert found.equals(psf.expected_information(model(), own, idata=idata, **FEW))
+
+
 def test_information_near_the_number_of_draws_is_called_a_lower_bound():
     wide = psf.expected_information(model(sd=1e3), {"pushed": DESIGNS["pushed"]}, **FEW)
     assert wide["low"].item() < np.log(60) + 1e-9
