@@ -111,7 +111,8 @@ def centring_of(
         Any point of the model, for the lengths of its variables.
     """
     clients = _clients(value, likelihoods)
-    columns = {_column(node): node.outputs[0] for node in clients.get(value, ())}
+    n_columns = np.shape(point[value.name])[-1]
+    columns = {_column(node, n_columns): node.outputs[0] for node in clients.get(value, ())}
     if None in columns or len(columns) < len(clients.get(value, ())):
         columns = {}
     parts = [_largest(part, clients, status, point) for part in (columns.values() or [value])]
@@ -139,13 +140,14 @@ def _clients(value: Variable, graphs: Sequence[Variable]) -> Clients:
     return clients
 
 
-def _column(node: Apply) -> int | None:
-    """The column of a table that a node takes; None if it does something else."""
+def _column(node: Apply, n_columns: int) -> int | None:
+    """The column of a table that a node takes, from the first; None if it does something else."""
     if not isinstance(node.op, Subtensor) or node.op.idx_list[:1] != (slice(None),):
         return None
     if len(node.inputs) != 2 or len(node.op.idx_list) != 2 or node.outputs[0].type.ndim != 1:
         return None
-    return int(node.inputs[1].data) if isinstance(node.inputs[1], Constant) else None
+    number = node.inputs[1]
+    return int(number.data) % n_columns if isinstance(number, Constant) else None
 
 
 def _largest(

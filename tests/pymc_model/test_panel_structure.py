@@ -74,6 +74,13 @@ def columns():
     panel(rate=pm.math.tanh(mu[0] - sd[0] * z[:, 0]), level=(mu[1] - z[:, 1]) / sd[1])
 
 
+def column_from_both_ends():
+    """One column by two numbers, in two forms."""
+    mu, sd = pm.Normal("mu"), pm.HalfNormal("sd")
+    z = pm.Normal("z", dims=("machine", "of"))
+    panel(rate=pm.math.tanh(mu + sd * z[:, 1]), level=z[:, -1])
+
+
 def table():
     """The effects of two parameters by one formula, with a mean for every machine."""
     mu, sd = pm.Normal("mu", shape=2), pm.HalfNormal("sd", shape=2)
@@ -196,6 +203,7 @@ FORMS = {  # own, population, shared
     factors: (["z"], ["typical", "omega"], []),
     around_zero: (["z"], ["typical", "omega"], []),
     columns: (["z"], ["mu", "sd"], []),
+    column_from_both_ends: (["z"], [], ["mu", "sd"]),
     table: (["z"], ["mu", "sd"], []),
     two_effects: (["z", "w"], ["mu", "sd"], []),
     factor_of_any_sign: (["z"], ["omega"], ["typical"]),
@@ -217,7 +225,7 @@ FORMS = {  # own, population, shared
 
 
 def model_of(form):
-    with pm.Model(coords={"machine": LABELS}) as model:
+    with pm.Model(coords={"machine": LABELS, "of": ["rate", "level"]}) as model:
         form()
     return model
 
