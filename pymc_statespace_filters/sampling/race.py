@@ -2,9 +2,10 @@
 
 The random walk runs first, as it needs no gradient: short at first, then longer and longer, each
 time with proposals made of the draws of the time before. Where it would take more than the first
-run of NUTS, NUTS starts at its points, in coordinates made of them. It ends where it is seen to
-take more than the walk; then, or where it diverges, the walk goes on from the points that are worth
-most, for at most as long as all has taken before.
+run of NUTS, or there are too many dimensions to learn proposals, NUTS starts at its points, in
+coordinates made of them. It ends where it is seen to take more than the walk; then, or where it
+diverges, the walk goes on from the points that are worth most, for at most as long as all has taken
+before.
 
 What a sampler takes is counted in evaluations, not in seconds, so that the outcome depends on no
 clock: a seed gives the same draws on an idle machine and on a busy one.
@@ -38,6 +39,8 @@ _MARGIN = 2.0  # by which NUTS may exceed what the walk is expected to take, an 
 _MOST_SPENT = 16.0  # by which it may exceed what the walks have taken
 _FEWER = 3  # by which its warm-up is shorter, as it knows the scales
 _N_POINTS = 4000  # of which proposals are made
+# For which 400 effective draws make proposals, three for each: in more, a longer walk is no better.
+_MOST_DIMENSIONS = 133
 # Share of the draws of NUTS that may diverge. What they cannot enter has about so much of the
 # posterior: left out at three standard deviations, it moves a mean by 0.03 of them, which 400
 # effective draws do not show. More than a tenth of it is told all the same.
@@ -80,6 +83,7 @@ def race(
             # Records find starts and proposals of their own, no better ones in a longer walk.
             unknown = 1.0 if isinstance(runs[0].target, RecordTarget) else _UNKNOWN
             is_hopeless = needed > unknown * most * request.draws
+            is_hopeless |= _has_no_proposals(runs[0])
             if is_hopeless or asked.max_draws == limit or not _is_too_short(runs[-1]):
                 break
             thin *= _LONGER
@@ -93,7 +97,9 @@ def race(
         from .nuts.sample_nuts import sample_nuts  # nutpie takes longer to import than the rest
 
         needed = goal * _evaluations(runs[-1]) / _effective(runs[-1])
-        most = min(_MARGIN * needed, _MOST_SPENT * sum(map(_evaluations, runs)))
+        most = _MARGIN * needed
+        if not _has_no_proposals(runs[0]):
+            most = min(most, _MOST_SPENT * sum(map(_evaluations, runs)))
         asked = left(request)._replace(tune=-(-request.tune // _FEWER))
         if asked.max_draws is not None:
             asked = asked._replace(max_draws=min(asked.max_draws, MOST_THIN[NUTS] * asked.draws))
@@ -122,6 +128,12 @@ def _is_too_short(walk: EndedRun) -> bool:
     request = walk.request
     is_last = 2 * walk.length.n_iterations > (request.max_draws or request.draws)
     return walk.is_complete and is_last and not is_enough(request, walk.convergence)
+
+
+def _has_no_proposals(walk: EndedRun) -> bool:
+    """Whether a longer walk would not have better proposals, as the dimensions are too many."""
+    is_of_records = isinstance(walk.target, RecordTarget)
+    return walk.positions.shape[1] > _MOST_DIMENSIONS and not is_of_records
 
 
 def _is_good(run: EndedRun, goal: SamplingRequest) -> bool:

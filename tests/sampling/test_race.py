@@ -119,6 +119,15 @@ def test_nuts_from_the_points_of_a_slow_walk(caplog, nuts_follows):
     assert not any("until_ess" in text for text in said)  # what the other lacks nobody needs
 
 
+def test_in_very_many_dimensions_nuts_follows_the_first_walk(caplog, walks):
+    """140 normal parameters, widths from 1 to 0.001: means are zero, within four errors."""
+    idata, _ = run(stiff(140), caplog, draws=250, chains=2)
+    assert len(walks) == 1
+    assert idata.attrs["sampler"] == "nuts"
+    x = idata["posterior"]["x"].values
+    assert abs(x.mean(axis=(0, 1)) / x.std(axis=(0, 1))).max() < 4 / np.sqrt(250)
+
+
 def test_no_clock_decides(request, caplog, nuts_follows, monkeypatch):
     monkeypatch.setattr(chosen_sampler, "TIME_LIMIT", np.inf)  # which alone depends on one
     call = {"draws": 100, "tune": 200}

@@ -6,13 +6,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..starts.langevin import metric_factor
+from ..starts.langevin import PER_DIMENSION, curvature_factor, metric_factor
 
 Array = NDArray[np.float64]
 WithGradient = Callable[[Array], tuple[float, Array]]
 
 _MOST_POINTS = 512  # whose gradients are asked
-_PER_DIMENSION = 3  # points at least
+_ENOUGH = (
+    4  # points per dimension; those of a walk in more than 128 dimensions depend on each other
+)
 
 
 class Frame(NamedTuple):
@@ -49,17 +51,25 @@ class Frame(NamedTuple):
         return in_frame
 
 
-def frame_of(points: Array, evaluate: WithGradient) -> Frame:
+def frame_of(points: Array, evaluate: WithGradient, *, takes_curvature: bool) -> Frame:
     """The frame of points (m, d) of a posterior and their gradients, see `metric_factor`.
 
-    Where the points are too few, or do not vary in every direction, that of their deviations.
+    Where the points are too few, that of the curvature at their mean; without it, or where they do
+    not vary in every direction, that of their deviations.
     """
     x = points[:: -(-len(points) // _MOST_POINTS)]
-    gradients = np.array([evaluate(point)[1] for point in x])
-    known = np.isfinite(gradients).all(axis=1)
-    factor = None
-    if known.sum() >= _PER_DIMENSION * x.shape[1]:
-        factor = metric_factor(x[known], gradients[known])
+
+    def gradients(x: Array) -> Array:
+        return np.array([evaluate(point)[1] for point in x])
+
+    factor, d = None, x.shape[1]
+    if takes_curvature and len(x) < _ENOUGH * d:
+        factor = curvature_factor(x, gradients)
+    elif len(x) >= PER_DIMENSION * d:
+        found = gradients(x)
+        known = np.isfinite(found).all(axis=1)
+        if known.sum() >= PER_DIMENSION * d:
+            factor = metric_factor(x[known], found[known])
     if factor is not None:
         return Frame(points.mean(axis=0), factor, is_whole=True)
     sd = points.std(axis=0)

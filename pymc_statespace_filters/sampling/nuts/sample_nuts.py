@@ -57,7 +57,7 @@ def sample_nuts(
     if points is None:
         points, frame = _starts(target, evaluate, request, rng, options, of_model(name))
     else:
-        frame = frame_of(points, evaluate)
+        frame = frame_of(points, evaluate, takes_curvature=target.takes_curvature)
     chains = run_nuts(
         density,
         points,
@@ -147,7 +147,8 @@ def _starts(
     if initvals is None and target.prior_draws.may_start:
         population = find_population(target, rng, progressbar=bool(options.progressbar))
         tell(SeparateModes(model, target.raveled, population, before_run=True), begin)
-        return population.x, frame_of(population.x, evaluate)
+        x, curved = population.x, target.takes_curvature
+        return x, frame_of(x, evaluate, takes_curvature=curved)
     start = make_initial_point_fn(model=model, overrides=dict(initvals or {}))(0)
     check_in_support(model, start, initvals)
     centre = target.raveled.ravel(start)

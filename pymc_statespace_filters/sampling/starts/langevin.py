@@ -13,6 +13,9 @@ the points and the inverse of that of their gradients. For a normal posterior th
 covariance, however the points are distributed, as long as they vary in every direction. For others
 it is an average over typical points, unlike the curvature at a mode where a scale vanishes.
 
+Where the points are too few for the number of parameters, the metric is the inverse of the
+curvature of the log-density at their mean, with the absolute values of its eigenvalues.
+
 The metric depends on the points that it moves, a bias that starts can bear.
 """
 
@@ -25,6 +28,8 @@ from numpy.typing import NDArray
 
 from ...statistics.student_mixture import standardised
 
+PER_DIMENSION = 3  # points at least, for the metric of points and gradients
+_OFFSET = 1e-4  # for differences of gradients, in standard deviations of the points
 _MOVES = 4  # of a round, between two looks at the log-density
 _KEPT = 3  # last rounds, of which the points are returned
 _MOST_ROUNDS = 40
@@ -50,12 +55,15 @@ def settle(x: Array, evaluate: WithGradient, rng: np.random.Generator) -> tuple[
     last three rounds of moves (3 m, k), and their log-densities.
     """
     cloud, step, rounds = _Cloud(x, *evaluate(x)), 1.0, []
+    is_few = len(x) < PER_DIMENSION * x.shape[1]
     threshold = _SETTLED * math.sqrt(x.shape[1] / 2)
     before = -np.inf
     for _ in range(_MOST_ROUNDS):
         total = 0.0
+        curved = curvature_factor(cloud.x, lambda x: evaluate(x)[1]) if is_few else None
         for _ in range(_MOVES):
-            cloud, rate = _moved(cloud, step, evaluate, rng)
+            chol = curved if is_few else _metric_of(cloud)
+            cloud, rate = _moved(cloud, step, chol, evaluate, rng)
             step = float(np.clip(step * math.exp(rate - _ACCEPTANCE), *_STEPS))
             total += float(cloud.log_density.mean())
         rounds.append(cloud)
@@ -78,19 +86,49 @@ def metric_factor(x: Array, gradient: Array) -> Array | None:
     cov = np.atleast_2d(np.cov(gradient @ points.chol, rowvar=False))
     variances, directions = np.linalg.eigh(cov)
     widths = np.maximum(variances, _MOST_WIDER**-2) ** -0.5
-    metric = points.chol @ (directions * widths) @ directions.T @ points.chol.T
+    return _lower(points.chol @ (directions * widths) @ directions.T @ points.chol.T)
+
+
+def curvature_factor(x: Array, gradients: Callable[[Array], Array]) -> Array | None:
+    """Lower factor (k, k) of the inverse curvature at the mean of points (m, k).
+
+    ``gradients`` gives those of the log-density (n, k) at points (n, k). None if one is not finite,
+    or if the points do not vary in a coordinate.
+    """
+    spread, k = x.std(axis=0), x.shape[1]
+    moves = np.diag(_OFFSET * spread)
+    found = gradients(np.concatenate([x.mean(axis=0) + moves, x.mean(axis=0) - moves]))
+    if not (np.isfinite(found).all() and (spread > 0.0).all()):
+        return None
+    # In units of the spread.
+    curvature = (found[:k] - found[k:]) * spread / (2 * _OFFSET)
+    values, directions = np.linalg.eigh(0.5 * (curvature + curvature.T))
+    widths = np.maximum(np.abs(values), 1 / _MOST_WIDER) ** -0.5
+    half = spread[:, np.newaxis] * directions * widths
+    return _lower(half @ half.T)
+
+
+def _lower(metric: Array) -> Array | None:
+    """The lower factor (k, k) of a metric; None if rounding has made it indefinite."""
     try:
         return np.linalg.cholesky(0.5 * (metric + metric.T))
     except np.linalg.LinAlgError:
         return None
 
 
-def _moved(
-    cloud: _Cloud, step: float, evaluate: WithGradient, rng: np.random.Generator
-) -> tuple[_Cloud, float]:
-    """Move every point by a Langevin step; also the acceptance rate."""
+def _metric_of(cloud: _Cloud) -> Array | None:
     known = np.isfinite(cloud.gradient).all(axis=1)
-    chol = metric_factor(cloud.x[known], cloud.gradient[known])
+    return metric_factor(cloud.x[known], cloud.gradient[known])
+
+
+def _moved(
+    cloud: _Cloud,
+    step: float,
+    chol: Array | None,
+    evaluate: WithGradient,
+    rng: np.random.Generator,
+) -> tuple[_Cloud, float]:
+    """Move every point by a Langevin step, if there is a metric; also the acceptance rate."""
     if chol is None:
         return cloud, 0.0
     drift = 0.5 * step**2 * cloud.gradient @ chol

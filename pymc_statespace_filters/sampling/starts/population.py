@@ -38,14 +38,13 @@ from ..target.target import MANY_DIMENSIONS, Target
 from ..target.variables import RaveledVariables
 from .annealing import N_SWEEPS, Population, anneal
 from .exact_fit import check_fit
-from .langevin import settle
+from .langevin import PER_DIMENSION, settle
 from .modes import Points, find_modes
 
 N_POINTS = 256
 _TYPICAL_EVALUATIONS = 36  # for each point, for the progress bar
 _DRAWN = 4  # draws of a reference for each point, at most N_POINTS or what a Gaussian filter finds
 _DEPTH, _DEPTH_PER_DIMENSION = 10.0, 3.0  # nats below the highest point, where points are left out
-_PER_DIMENSION = 3  # points, for the metric of these moves
 _TYPICAL_MOVES = 40  # of each point, for the progress bar
 _MOST_BATCHES = 10  # of draws of the prior
 _FEWEST = 16  # points of positive likelihood, for a pilot to lead the way
@@ -203,11 +202,13 @@ def _settled(
 ) -> tuple[Array, Array] | None:
     """Points of the last sweep moved along the gradient, and their log-densities.
 
-    None in few dimensions, where the annealing is enough, or if there is no gradient.
+    None in few dimensions, where the annealing is enough, in too many for these points, or if there
+    is no gradient.
     """
     dim = target.raveled.dim
     last = x[-(len(x) // N_SWEEPS) :]
-    if dim < MANY_DIMENSIONS or len(last) < _PER_DIMENSION * dim:
+    is_few = len(last) < PER_DIMENSION * dim
+    if dim < MANY_DIMENSIONS or (is_few and not target.takes_curvature):
         return None
     rows = target.gradient_rows(of_pilot=of_pilot)
     if rows is None:

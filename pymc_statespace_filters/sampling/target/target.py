@@ -20,6 +20,7 @@ from ...parallel.communicator import Communicator
 from ...parallel.signals import held_interrupts
 from ...pymc_model.graph_rewrites import coarse_filters, expensive_variables, pilot_filters
 from ...pymc_model.inspection import state_space_nodes
+from ...pymc_model.panel_structure import panel_structure
 from ..kernel.state import ChainState, RandomBlock, draw_seeds, random_block
 from ..kernel.transition import evaluate
 from .leader_follower import check_group
@@ -29,6 +30,7 @@ from .settings import RandomWalkSettings, checked_proposal_cov
 
 PILOT_POWER = 0.5
 MANY_DIMENSIONS = 9  # in which moves along the gradient are worth its compilation
+_MOST_CURVED = 512  # dimensions; the curvature takes two gradients for each
 
 
 class Target(SampledModel):
@@ -90,6 +92,14 @@ class Target(SampledModel):
                 )
             graph = screening_density(model, settings.screen, settings.screen_power)
             self.screen = LogDensity(*self._shared, fixed_noise=settings.screen.noisy, graph=graph)
+
+    @cached_property
+    def takes_curvature(self) -> bool:
+        """Whether curvature makes coordinates where points are too few for them.
+
+        Not of a panel, whose parameters are many and correlated within records only.
+        """
+        return self.raveled.dim <= _MOST_CURVED and panel_structure(self.model) is None
 
     @cached_property
     def is_expensive(self) -> bool:
