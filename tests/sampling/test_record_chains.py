@@ -125,6 +125,31 @@ def test_a_spread_of_random_effects_by_quadrature(filter):
         assert abs(draws.mean() - mean) < 4.5 * az.mcse(draws, method="mean")
 
 
+def test_random_effects_that_start_at_zero():
+    """They have a location without parameters. Two comparisons: one false alarm in 70000 seeds."""
+    labels, data = list("abcd"), data_of(4)
+    with pm.Model(coords={"place": labels}) as model:
+        sd = pm.HalfNormal("sd", 1.0, initval=0.5)
+        z = pm.Normal("z", dims="place")
+        psf.StateSpace(
+            "d",
+            SYSTEM,
+            psf.EKF(),
+            panel=np.repeat(labels, N_ROWS),
+            steps=np.tile(np.arange(1, N_ROWS + 1), len(labels)),
+            observed=data,
+            params={"level": 1.0 + sd * z},
+        )
+    drawn = chains(model)["posterior"]["sd"].values
+    grid = np.linspace(1e-4, 6.0, 20001)
+    variance = grid**2 + (PROCESS_VAR + MEASUREMENT_VAR) / N_ROWS
+    squares = ((data.reshape(-1, N_ROWS).mean(axis=1) - 1.0) ** 2).sum()
+    weights = np.exp(-0.5 * (len(labels) * np.log(variance) + squares / variance + grid**2))
+    weights /= weights.sum()
+    for draws, mean in ((drawn, grid @ weights), (drawn**2, grid**2 @ weights)):
+        assert abs(draws.mean() - mean) < 4.5 * az.mcse(draws, method="mean")
+
+
 def of_random_effects(means):
     """E mu, E sd, E mu^2, E sd^2 and E z of each record, from the means of their rows."""
     sd = np.linspace(1e-4, 6.0, 20001)

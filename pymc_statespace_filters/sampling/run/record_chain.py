@@ -35,6 +35,7 @@ from .thinned_draws import Thinning
 
 # Draws of the prior of which each record starts at the likeliest.
 N_TRIED = 50
+APART = 0.1  # sd of random effects at the start in place of zeros
 
 
 class _Terms(NamedTuple):
@@ -49,6 +50,20 @@ class _Terms(NamedTuple):
     def is_finite(self) -> np.ndarray:
         """Whether each term is, (G + 1,)."""
         return np.isfinite(self.estimates + self.priors)
+
+
+def _with_effects(
+    position: np.ndarray, centred: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """A position of the model with small numbers where random effects are zero.
+
+    PyMC starts them there by default. Centred ones would all be at their location, where the
+    density of their scale has no integral: it would go to zero, and not come back.
+    """
+    moved = position.copy()
+    zeros = centred[position[centred] == 0.0]
+    moved[zeros] = APART * rng.standard_normal(len(zeros))
+    return moved
 
 
 class RecordChain(ChainArrays):
@@ -113,7 +128,10 @@ class RecordChain(ChainArrays):
         """
         failures: list[int] = []
         layout = self._target.layout
-        candidates = [self._densities.centred(position, layout) for position in candidates]
+        candidates = [
+            self._densities.centred(_with_effects(position, layout.centred, rng), layout)
+            for position in candidates
+        ]
 
         def evaluate(position: np.ndarray) -> _Terms:
             self._check_pause()
