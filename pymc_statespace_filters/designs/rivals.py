@@ -53,6 +53,9 @@ def named_models(models: Any) -> dict[str, pm.Model]:
     if not found or not all(isinstance(one, pm.Model) for one in found.values()):
         got = list(found.values()) or models
         raise ModelError(f"models must be a pymc.Model, or a dict of them by name, got {got!r}")
+    for name in found:
+        if not isinstance(name, str) or not name:
+            raise ModelError(f"names of models must be non-empty strings, got {name!r}")
     return found
 
 

@@ -449,5 +449,9 @@ def test_models_that_do_not_compare():
     )
 
 
+def test_names_of_models():
+    refused("names of models must be non-empty strings, got 2", models={"a": model(), 2: model()})
+
+
 def test_odds_below_one():
     refused("odds must be at least 1, got 0.5", odds=0.5)
