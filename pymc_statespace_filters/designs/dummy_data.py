@@ -1,5 +1,7 @@
 """A model of records to come: its StateSpace variables need data for PyMC, which nothing reads."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -32,7 +34,19 @@ def with_dummy_data(model: pm.Model) -> pm.Model:
             shapes[name] = node.outputs[1].shape.eval(mode="FAST_COMPILE")
     if shapes:
         order = [rv.name for rv in model.free_RVs]
-        model = pm.observe(model, {name: np.zeros(shape) for name, shape in shapes.items()})
+        with _without_initial_values(model):
+            model = pm.observe(model, {name: np.zeros(shape) for name, shape in shapes.items()})
         # The copy has them in an order that differs from process to process.
         model.free_RVs.sort(key=lambda rv: order.index(rv.name))
     return model
+
+
+@contextmanager
+def _without_initial_values(model: pm.Model) -> Iterator[None]:
+    """PyMC copies no model that has some; draws of priors and posteriors need none."""
+    given = dict(model.rvs_to_initial_values)
+    model.rvs_to_initial_values.update(dict.fromkeys(given))
+    try:
+        yield
+    finally:
+        model.rvs_to_initial_values.update(given)

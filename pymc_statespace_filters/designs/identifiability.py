@@ -34,6 +34,7 @@ N_PRIOR = 4000  # draws, for the covariance of the prior
 LEAST_ROWS, ROWS_OF_PARAMETER = 500, 50  # rows of all simulated records of a point
 LEAST_LEFT = 0.25  # share of the points that must have a likelihood
 N_FULL = 6  # full posteriors
+SINGULAR = 1e-12  # eigenvalue of the prior's correlations, next to rounding
 
 Array = NDArray[np.float64]
 
@@ -168,6 +169,7 @@ def identifiability(
     rows = max(LEAST_ROWS, ROWS_OF_PARAMETER * len(sd))
     n_records = ceil(rows / likelihood.n_rows) if n_records is None else n_records
     cov, covs, kept = normal_covariance(coordinates(prior)), [], []
+    _check_prior(cov, elements)
     with row_progress(likelihood, enabled=progressbar) as announce:
         announce("simulated records", len(x) * n_records)
         for point in x:
@@ -211,6 +213,18 @@ def _chosen(elements: Elements, var_names: str | Iterable[str] | None) -> NDArra
         raise ModelError("var_names must name at least one free variable, got none")
     columns = [column for name in names for column in elements.columns(name, "var_names")]
     return np.array(list(dict.fromkeys(columns)))
+
+
+def _check_prior(cov: Array, elements: Elements) -> None:
+    """Raise if the prior gives a parameter as a function of others."""
+    sd = np.sqrt(np.diagonal(cov))
+    shares, axes = np.linalg.eigh(np.nan_to_num(cov / np.outer(sd, sd)))
+    if shares[0] < SINGULAR:
+        labels = [str(elements.labels[i]) for i in np.flatnonzero(np.abs(axes[:, 0]) > 0.1)]
+        raise ModelError(
+            f"free variables must not be functions of each other in the prior, got {labels}: make "
+            "one of them a pm.Deterministic"
+        )
 
 
 def _posterior_points(model: pm.Model, own: pm.Model, idata: Any, n_draws: int) -> Array:

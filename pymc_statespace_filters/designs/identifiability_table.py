@@ -150,21 +150,26 @@ def _of_parameters(
     is_open = ~(exponents != 0).any(axis=0) & ~_differs(expected)
     alone = table.iloc[[i for i in chosen if is_open[i]]]
     nothing, weak = alone["ratio"] >= NOTHING, alone["ratio"] >= WEAK
+    say = "The data say" if expected.compared()[0] else "If posteriors are normal, the data say"
     if nothing.any():
-        yield f"The data say nothing of {_listed(alone.index[nothing])}."
+        yield f"{say} nothing of {_listed(alone.index[nothing])}."
     little = alone[weak & ~nothing]
     if len(little):
-        yield f"The data say little of {_listed(little.index)}: {_remain(little)}."
+        yield f"{say} little of {_listed(little.index)}: {_remain(little)}."
 
 
 def _of_full(expected: Expected, chosen: Columns) -> Iterator[str]:
     n_full = len(expected.full_sds)
     n_passed, full, predicted = expected.compared()
     if n_passed < n_full:
+        unchecked = (
+            " The ratios are those of normal posteriors, and not checked; that of the width of a "
+            "population is too large."
+        )
         yield (
-            f"The full posteriors of {n_full - n_passed} of {n_full} simulated records are so far "
-            "from normal that importance sampling failed: simulate some records, and sample their "
-            "posteriors."
+            f"Importance sampling of the full posteriors of {n_full - n_passed} of {n_full} "
+            "simulated records failed, as they are far from normal or have many parameters: "
+            f"simulate some records, and sample their posteriors." + unchecked * (not n_passed)
         )
     differs = _differs(expected)
     texts = [

@@ -14,6 +14,7 @@ from pymc_statespace_filters.designs.fisher_information import (
     Likelihood,
     normal_covariance,
 )
+from pymc_statespace_filters.designs.identifiability_table import Expected, table_of
 from pymc_statespace_filters.designs.weak_directions import (
     combination_label,
     determined_combinations,
@@ -257,6 +258,30 @@ def test_width_of_a_population_needs_full_posteriors():
     )
 
 
+def test_without_full_posteriors_the_ratios_are_called_unchecked():
+    """As of a panel of sixty, where importance sampling fails."""
+    covs = np.diag([0.99, 0.5])[None] ** 2
+    expected = Expected(
+        ["tau", "level"], np.array(["log", "value"]), np.eye(2), covs[[0, 0]], [None]
+    )
+    assert table_of(expected, np.arange(2), []).sentences == (
+        "If posteriors are normal, the data say nothing of tau.",
+        "If posteriors are normal, the data say little of level: 50 % of its prior remains.",
+        "Importance sampling of the full posteriors of 1 of 1 simulated records failed, as they "
+        "are far from normal or have many parameters: simulate some records, and sample their "
+        "posteriors. The ratios are those of normal posteriors, and not checked; that of the width "
+        "of a population is too large.",
+    )
+
+
+def test_a_model_with_initial_values():
+    with pm.Model() as model:
+        pm.Normal("a", initval=2.0)
+        psf.StateSpace("d", line(), psf.EKF(), params={"b": 0.0, "c": 0.0}, steps=[0, 1], inputs=U)
+    assert [rv.name for rv in with_dummy_data(model).observed_RVs] == ["d"]
+    assert model.rvs_to_initial_values[model["a"]] == 2.0
+
+
 def test_heavy_tails_do_not_count():
     rng = np.random.default_rng(1)
     factor = np.array([[1.0, 0.0], [0.6, 0.8]])
@@ -345,6 +370,14 @@ def test_models_that_cannot_be_treated():
         psf.StateSpace("d", line(), psf.EKF(), **record)
     assert refusal(improper) == (
         "the prior of a is improper and cannot be sampled: give it a proper prior"
+    )
+    with pm.Model() as doubled:
+        pm.Normal("a")
+        pm.Normal("b", doubled["a"], 1e-12)
+        psf.StateSpace("d", line(), psf.EKF(), **record | {"params": {"c": 0.0}})
+    assert refusal(doubled) == (
+        "free variables must not be functions of each other in the prior, got ['a', 'b']: make one "
+        "of them a pm.Deterministic"
     )
     with pm.Model() as noisy:
         pm.Normal("a")
