@@ -10,9 +10,11 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ..evidence.comparison.comparison_sentences import approximation, joined, quoted
+from ..filters.written import short_form
 from ..tables import SentenceTable
 from .information import (
     DECIDED,
+    INVERSE,
     MISLED,
     MODEL,
     PARAMETERS,
@@ -24,6 +26,7 @@ from .information import (
 from .rivals import Rival
 
 SIGNIFICANT = 2.0  # standard errors
+MOST_INVERSE = 15.0  # log of a mean that is 1: it is as large with a probability of exp(-15)
 
 Array = NDArray[np.float64]
 
@@ -75,7 +78,10 @@ def table_of(
     }
     data = pd.DataFrame.from_dict(rows, orient="index")
     data.index.name = "design"
-    return DesignsTable(data, sentences=list(_sentences(data, rivals, weights, about)))
+    said = [*_sentences(data, rivals, weights, about)]
+    if var_names is None:
+        said += _impossible(replicated, rivals)
+    return DesignsTable(data, sentences=said)
 
 
 def _ranking(own: Mapping[str, Array], ranks_by: str, difference: Estimate) -> dict[str, Any]:
@@ -98,7 +104,7 @@ def _further(
     found: dict[str, float] = {}
     for key, replicates in own.items():
         kind, _, index = key.removesuffix("]").partition("[")
-        if kind.startswith(MODEL):
+        if kind.startswith((MODEL, INVERSE)):
             continue
         numbers = [int(i) for i in index.split(", ")] if index else list(range(len(models)))
         label = f"[{', '.join(models[i] for i in numbers)}]" if index else ""
@@ -139,14 +145,33 @@ def _of(name: str, rivals: Mapping[str, Rival]) -> str:
     return "" if len(rivals) == 1 else f" of {name!r}"
 
 
+def _impossible(
+    replicated: Mapping[str, Mapping[str, Array]], rivals: Mapping[str, Rival]
+) -> Iterator[str]:
+    """Say which designs prove a filter wrong, by Markov's inequality."""
+    for i, (name, rival) in enumerate(rivals.items()):
+        logs = {design: own[f"{INVERSE}[{i}]"][0] for design, own in replicated.items()}
+        if wrong := [design for design, log in logs.items() if log > MOST_INVERSE]:
+            other = "GridFilter()" if rival.system.n == 1 else "another filter"
+            yield (
+                f"With {quoted(wrong)} other parameters explain records{_of(name, rivals)} better "
+                f"by {max(logs.values()):.0f} nats than those that made them, which is impossible: "
+                f"the likelihood of {short_form(rival.filter)} is wrong there, and all numbers of "
+                f"these designs with it: take {other}."
+            )
+
+
 def _not_told_apart(table: pd.DataFrame) -> Iterator[str]:
     first, *others = table.index
     near = [n for n in others if -table.loc[n, "diff"] < SIGNIFICANT * table.loc[n, "dse"]]
     if near:
         verb = "is" if len(near) == 1 else "are"
+        bounds = (table["high"] - table["low"])[[first, *near]]
+        together = "a larger n_draws brings low and high together, and "
         yield (
-            f"{quoted(near)} {verb} not told apart from {first!r} (a difference below 2 dse): a "
-            "larger n_records, or target_se, makes the errors smaller."
+            f"{quoted(near)} {verb} not told apart from {first!r} (a difference below 2 dse): "
+            f"{together if bounds.max() > table.loc[near, 'dse'].max() else ''}"
+            "a larger n_records, or target_se, makes the errors smaller."
         )
 
 

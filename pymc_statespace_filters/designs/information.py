@@ -20,6 +20,7 @@ from scipy.special import logsumexp
 Array = NDArray[np.float64]
 
 MODEL, PARAMETERS, DECIDED, MISLED = "model", "parameters", "decided", "misled"
+INVERSE = "inverse"
 
 
 class Records(NamedTuple):
@@ -90,6 +91,11 @@ def replicates(records: Records, weights: Array, odds: float) -> dict[str, Array
         If i is true: the probability that its posterior odds against all others together are above
         ``odds``, and that those of a wrong model are. Without index, over all models.
 
+    ``inverse[i]``
+        Log of the mean over records of the evidence without the draw that made the record over the
+        likelihood at it. The mean is expected to be 1 whatever the draws are, if the likelihood is
+        that of the records.
+
     ``parameters[i]`` and ``model`` are in the middle between low and high.
     """
     with np.errstate(invalid="ignore"):
@@ -105,6 +111,8 @@ def _quantities(records: Records, weights: Array, odds: float) -> Iterator[tuple
     for i, (without, including, lowest, highest, kept) in enumerate(evidences):
         low, high = _mean(lowest - including, kept), _mean(highest - without[:, i], kept)
         yield from _between(PARAMETERS, low, high, f"[{i}]")
+        ratios = np.where(kept > 0, without[:, i] - lowest, -np.inf)
+        yield f"{INVERSE}[{i}]", logsumexp(ratios, axis=0) - np.log(kept.sum(axis=0))
     if n_models == 1:
         return
     entropy = -(weights * np.log(weights)).sum()

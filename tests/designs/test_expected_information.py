@@ -4,6 +4,8 @@ With 200 records and 400 draws the mean of z^2 over seeds 0 to 39 was 1.01 to 1.
 designs, and 1.22 for differences from the first.
 """
 
+import re
+
 import arviz as az
 import numpy as np
 import pandas as pd
@@ -264,6 +266,36 @@ def test_an_approximate_filter_is_doubted():
     assert found.sentences[-1] == (
         "The likelihood of 'model' is a filter's approximation; se does not include its error."
     )
+
+
+def test_records_that_other_parameters_explain_too_well_prove_a_filter_wrong():
+    """A sensor that folds: the tangent at zero is flat, and noise explains what is seen."""
+    folded = psf.StateSpaceModel(
+        transition=lambda x, q: [q[0]],
+        process_noise=[[1.0]],
+        observation=lambda x: [x[0] ** 2],
+        observation_noise=lambda sd: [[sd**2]],
+        initial_mean=[0.0],
+        initial_cov=[[1.0]],
+    )
+    steps = {"steps": range(8)}
+    for filter, is_wrong in ((psf.EKF(), True), (psf.GridFilter(), False)):
+        with pm.Model() as model:
+            pm.Uniform("sd", 0.1, 0.8)
+            psf.StateSpace("d", folded, filter, **steps)
+        designs = {"few": steps, "at the start": {"steps": [0, 1]}}
+        table = psf.expected_information(
+            model, designs, n_records=40, n_draws=40, random_seed=1, progressbar=False
+        )
+        said = [one for one in table.sentences if "impossible" in one]
+        assert len(said) == is_wrong
+        if is_wrong:
+            assert re.fullmatch(
+                r"With 'few' and 'at the start' other parameters explain records better by \d+ "
+                r"nats than those that made them, which is impossible: the likelihood of EKF\(\) is "
+                r"wrong there, and all numbers of these designs with it: take GridFilter\(\)\.",
+                said[0],
+            )
 
 
 def test_a_filter_without_a_pass_of_many_points():
