@@ -125,12 +125,16 @@ def test_a_spread_of_random_effects_by_quadrature(filter):
         assert abs(draws.mean() - mean) < 4.5 * az.mcse(draws, method="mean")
 
 
-def test_random_effects_that_start_at_zero():
+@pytest.mark.parametrize("is_centred", [False, True])
+def test_random_effects_that_start_at_their_mean(is_centred):
     """They have a location without parameters. Two comparisons: one false alarm in 70000 seeds."""
     labels, data = list("abcd"), data_of(4)
     with pm.Model(coords={"place": labels}) as model:
         sd = pm.HalfNormal("sd", 1.0, initval=0.5)
-        z = pm.Normal("z", dims="place")
+        if is_centred:
+            level = pm.Normal("level", 1.0, sd, dims="place")
+        else:
+            level = 1.0 + sd * pm.Normal("z", dims="place")
         psf.StateSpace(
             "d",
             SYSTEM,
@@ -138,7 +142,7 @@ def test_random_effects_that_start_at_zero():
             panel=np.repeat(labels, N_ROWS),
             steps=np.tile(np.arange(1, N_ROWS + 1), len(labels)),
             observed=data,
-            params={"level": 1.0 + sd * z},
+            params={"level": level},
         )
     drawn = chains(model)["posterior"]["sd"].values
     grid = np.linspace(1e-4, 6.0, 20001)

@@ -35,7 +35,7 @@ from .thinned_draws import Thinning
 
 # Draws of the prior of which each record starts at the likeliest.
 N_TRIED = 50
-APART = 0.1  # sd of random effects at the start in place of zeros
+APART = 0.1  # relative sd over records, of values that would be the same at the start
 
 
 class _Terms(NamedTuple):
@@ -52,17 +52,21 @@ class _Terms(NamedTuple):
         return np.isfinite(self.estimates + self.priors)
 
 
-def _with_effects(
-    position: np.ndarray, centred: np.ndarray, rng: np.random.Generator
-) -> np.ndarray:
-    """A position of the model with small numbers where random effects are zero.
+def _apart(position: np.ndarray, own: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A position of the model, whose records have not all the same value of their own (G, k).
 
-    PyMC starts them there by default. Centred ones would all be at their location, where the
-    density of their scale has no integral: it would go to zero, and not come back.
+    Values that a user leaves out are PyMC's default, which often is the same for all records. Where
+    all are at the mean of their prior, the density of its scale has no integral: the scale would go
+    to zero, and not come back.
     """
+    values = position[own]
+    sizes = np.where(values == 0.0, 1.0, np.abs(values))
     moved = position.copy()
-    zeros = centred[position[centred] == 0.0]
-    moved[zeros] = APART * rng.standard_normal(len(zeros))
+    moved[own] += np.where(
+        (np.ptp(values, axis=0) == 0.0) & (len(own) > 1),
+        APART * sizes * rng.standard_normal(values.shape),
+        0.0,
+    )
     return moved
 
 
@@ -129,7 +133,7 @@ class RecordChain(ChainArrays):
         failures: list[int] = []
         layout = self._target.layout
         candidates = [
-            self._densities.centred(_with_effects(position, layout.centred, rng), layout)
+            self._densities.centred(_apart(position, layout.own, rng), layout)
             for position in candidates
         ]
 
