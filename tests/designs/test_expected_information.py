@@ -292,8 +292,8 @@ def test_records_that_other_parameters_explain_too_well_prove_a_filter_wrong():
         if is_wrong:
             assert re.fullmatch(
                 r"With 'few' and 'at the start' other parameters explain records better by \d+ "
-                r"nats than those that made them, which is impossible: the likelihood of EKF\(\) is "
-                r"wrong there, and all numbers of these designs with it: take GridFilter\(\)\.",
+                r"nats than those that made them, which is impossible: the likelihood of EKF\(\) "
+                r"is wrong there, and all numbers of these designs with it: take GridFilter\(\)\.",
                 said[0],
             )
 
