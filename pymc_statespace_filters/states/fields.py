@@ -93,7 +93,8 @@ def field(
             States at the times of the observations, drawn given all data; dims (visit,
             visited_state).
 
-        The attribute ``doubts`` has what was warned of, and ``ci_prob`` the probability.
+        The attribute ``doubts`` has what was warned of, and is empty if nothing was; ``ci_prob`` is
+        the probability of the band.
 
     Raises
     ------
@@ -177,7 +178,7 @@ def field(
         ]
         for doubt in doubts:
             warnings.warn(doubt, ModelWarning, skip_file_prefixes=INSIDE)
-        found[name] = data.assign_attrs(ci_prob=ci_prob, doubts=doubts)
+        found[name] = data.assign_attrs(ci_prob=ci_prob, doubts="; ".join(doubts))
     return xr.DataTree.from_dict(found)
 
 

@@ -98,7 +98,7 @@ def test_moments_and_bands_are_those_of_the_regression(found):
 
 
 def test_visited_states_are_those_of_the_record(found):
-    assert found.attrs["doubts"] == []
+    assert found.attrs["doubts"] == ""
     visited = found["visited"].sel(visited_state="z").values.reshape(-1, len(RECORD))
     np.testing.assert_allclose(visited, np.tile(RECORD, (len(visited), 1)), atol=1e-5)
     distance = abs(RECORD - np.linspace(-2, 2, 101)[:, None])
