@@ -156,10 +156,12 @@ def _draws(
     check_free_variables(model)
     if idata is not None:
         return _independent(unconstrained_draws(idata, model), n_draws, rng)
-    if model.potentials:
+    nodes = state_space_nodes(model)
+    left_out = [rv.name for rv in (*model.observed_RVs, *model.potentials) if rv.name not in nodes]
+    if left_out:
         raise ModelError(
-            f"draws of the prior leave out the potentials {[p.name for p in model.potentials]}: "
-            "give draws as idata="
+            f"draws of the prior know nothing of {left_out}, data or potentials of the model: give "
+            "draws of its posterior as idata="
         )
     return ModelPrior(model).sample(n_draws, rng), n_draws, n_draws
 

@@ -437,9 +437,11 @@ def test_models_of_which_no_record_is_one():
     refused("models: a design needs a model with one StateSpace variable, got []", models=empty)
     refused("models must be a pymc.Model, or a dict of them by name, got [3]", models={"a": 3})
     with model() as doubted:
+        pm.Normal("weighed", doubted["gain"], 1.0, observed=0.3)
         pm.Potential("more", -(doubted["gain"] ** 2))
     refused(
-        "models: draws of the prior leave out the potentials ['more']: give draws as idata=",
+        "models: draws of the prior know nothing of ['weighed', 'more'], data or potentials of the "
+        "model: give draws of its posterior as idata=",
         models=doubted,
     )
 
