@@ -34,6 +34,7 @@ os.environ.setdefault("MPLBACKEND", "agg")
 # Neighbours share no system, so that the two processes do not compile the same code at once.
 LONGEST = (
     "filters/test_ensemble_states.py",
+    "sampling/test_race.py",
     "filters/test_truth_regimes.py",
     "point_estimation/test_maximum_likelihood.py",
     "sampling/test_sample_dram.py",

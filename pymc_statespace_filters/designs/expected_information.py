@@ -98,17 +98,17 @@ def expected_information(
         draws are too few, how many draws were used, and which likelihoods are approximate. All
         information is in nats. ``table.to_string()`` shows all columns:
 
-        ``information`` *, ``low`` *, ``high`` *, ``se`` *, ``change``, ``low_se``, ``high_se``
+        ``information`` \*, ``low`` \*, ``high`` \*, ``se`` \*, ``change``, ``low_se``, ``high_se``
             Of several models: expected information about which one is true. ``low``, from evidences
             without the draw that made the record, is a lower bound; in ``high`` that draw is in the
             evidence of the true model. Of one model: expected information about its parameters,
             ``low`` by the contrastive estimate, a lower bound, and ``high`` by the nested one, an
             upper bound. ``information`` is the middle, ``se`` its standard error, and ``change``
             how far it has moved from what half of the draws give.
-        ``diff`` *, ``dse`` *
+        ``diff`` \*, ``dse`` \*
             Difference from the first row, and its standard error, to which noise that designs have
             in common does not contribute.
-        ``decided`` *, ``misled`` *
+        ``decided`` \*, ``misled`` \*
             Of several models: the probability that the posterior odds of the true model against all
             others together will be above `odds`, and that those of a wrong one will be.
             ``decided[a]``, ``misled[a]``: the same if model a is true.

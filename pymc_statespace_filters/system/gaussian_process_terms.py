@@ -223,7 +223,7 @@ def gaussian_process_terms(
     See Also
     --------
     polynomial_terms : Monomials, and functions of your own.
-    field : The field with its band, from draws of the coefficients.
+    pymc_statespace_filters.field : The field with its band, from draws of the coefficients.
 
     Notes
     -----
