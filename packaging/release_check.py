@@ -24,9 +24,10 @@ from time import perf_counter
 ROOT = Path(__file__).parents[1]
 DIST = ROOT / "dist"
 PACKAGE = "pymc_statespace_filters"
-# 1.28 MB when this was set, and 5 %: who adds more makes the package smaller elsewhere, or says
-# here what is worth the bytes that every user loads.
-MAX_WHEEL_BYTES = 1_350_000
+# 1.38 MB when this was set, and 5 %: who adds more makes the package smaller elsewhere, or says
+# here what is worth the bytes that every user loads. The last 0.1 MB: events and clinical tables,
+# censored data, designs of experiments, identifiability, and fields of unknown form.
+MAX_WHEEL_BYTES = 1_450_000
 MAX_BYTES_WITH_CODE = 15_000_000  # 8.2 MB when this was set
 CODE = f"{PACKAGE}/_machine_code/"
 
