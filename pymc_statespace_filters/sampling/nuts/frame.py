@@ -12,9 +12,8 @@ Array = NDArray[np.float64]
 WithGradient = Callable[[Array], tuple[float, Array]]
 
 _MOST_POINTS = 512  # whose gradients are asked
-_ENOUGH = (
-    4  # points per dimension; those of a walk in more than 128 dimensions depend on each other
-)
+# Points per dimension; those of a walk in more than 128 dimensions depend on each other.
+_ENOUGH = 4
 
 
 class Frame(NamedTuple):
