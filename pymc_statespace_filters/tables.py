@@ -1,6 +1,6 @@
 """Tables that print their main columns, and sentences below them, in 80 columns of text."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from textwrap import fill
 from typing import Any, ClassVar, Self
@@ -13,6 +13,17 @@ WIDTH = 80
 def wrapped(sentences: Sequence[str]) -> list[str]:
     """Sentences as paragraphs that fit into `WIDTH`, with an indent from the second line on."""
     return [fill(text, WIDTH, subsequent_indent="  ") for text in sentences]
+
+
+def quoted(names: Iterable[str]) -> str:
+    """Names in quotes, joined."""
+    return joined([repr(name) for name in names])
+
+
+def joined(parts: Iterable[str]) -> str:
+    """Join as in "a, b and c"."""
+    *others, last = parts
+    return f"{', '.join(others)} and {last}" if others else last
 
 
 class SentenceTable(pd.DataFrame):

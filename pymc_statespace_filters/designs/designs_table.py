@@ -9,9 +9,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ..evidence.comparison.comparison_sentences import approximation, joined, quoted
+from ..evidence.comparison.comparison_sentences import approximation
 from ..filters.written import short_form
-from ..tables import SentenceTable
+from ..tables import SentenceTable, joined, quoted
 from .information import (
     DECIDED,
     INVERSE,

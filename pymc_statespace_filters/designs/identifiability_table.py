@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ..tables import SentenceTable
+from ..tables import SentenceTable, joined
 from .weak_directions import (
     WEAK,
     combination_label,
@@ -138,7 +138,7 @@ def _of_combinations(
         members = table[one != 0]
         how_well = precision(sd, is_log=members["coordinate"].iloc[0] == "log")
         yield (
-            f"{name} is determined {how_well}, {_listed(members.index)} alone are not: "
+            f"{name} is determined {how_well}, {joined(members.index)} alone are not: "
             f"{_remain(members)}."
         )
 
@@ -152,10 +152,10 @@ def _of_parameters(
     nothing, weak = alone["ratio"] >= NOTHING, alone["ratio"] >= WEAK
     say = "The data say" if expected.compared()[0] else "If posteriors are normal, the data say"
     if nothing.any():
-        yield f"{say} nothing of {_listed(alone.index[nothing])}."
+        yield f"{say} nothing of {joined(alone.index[nothing])}."
     little = alone[weak & ~nothing]
     if len(little):
-        yield f"{say} little of {_listed(little.index)}: {_remain(little)}."
+        yield f"{say} little of {joined(little.index)}: {_remain(little)}."
 
 
 def _of_full(expected: Expected, chosen: Columns) -> Iterator[str]:
@@ -169,7 +169,7 @@ def _of_full(expected: Expected, chosen: Columns) -> Iterator[str]:
         yield (
             f"Importance sampling of the full posteriors of {n_full - n_passed} of {n_full} "
             "simulated records failed, as they are far from normal or have many parameters: "
-            f"simulate some records, and sample their posteriors." + unchecked * (not n_passed)
+            "simulate some records, and sample their posteriors." + unchecked * (not n_passed)
         )
     differs = _differs(expected)
     texts = [
@@ -180,7 +180,7 @@ def _of_full(expected: Expected, chosen: Columns) -> Iterator[str]:
     if texts:
         yield (
             f"The posteriors are not normal: by full posteriors of {n_passed} simulated records "
-            f"the ratio is {_listed(texts)}."
+            f"the ratio is {joined(texts)}."
         )
 
 
@@ -194,9 +194,4 @@ def _remain(table: pd.DataFrame) -> str:
     shares = [f"{100 * ratio:.0f} %" for ratio in table["ratio"]]
     if len(shares) == 1:
         return f"{shares[0]} of its prior remains"
-    return f"{_listed(shares)} of their priors remain"
-
-
-def _listed(texts: Any) -> str:
-    *first, last = map(str, texts)
-    return f"{', '.join(first)} and {last}" if first else last
+    return f"{joined(shares)} of their priors remain"

@@ -129,17 +129,6 @@ class GaussianProcessTerms:
             density = pt.exp(log_scale - (nu + d / 2) * pt.log(2 * nu + squares))
         return amplitude * pt.sqrt(pt.prod(lengths) * density)
 
-    def share_beyond(self, x: Any) -> float:
-        """The share of states (n_states, ...) that lie beyond the boundary; of one, any shape."""
-        values, d = check_floats("x", x, None), len(self.states)
-        if d > 1 and values.shape[:1] != (d,):
-            raise ModelError(
-                f"x must hold the states {list(self.states)}, got shape {values.shape}"
-            )
-        values = values.reshape(d, -1)
-        low, high = self.boundary.T[..., None]
-        return float(((values < low) | (values > high)).any(axis=0).mean())
-
     def _half_waves(self) -> product:
         """Of each function the numbers of half waves; those along the last state change fastest."""
         return product(*(range(1, n + 1) for n in self.n))
@@ -229,7 +218,7 @@ def gaussian_process_terms(
     -----
     The functions vanish at ``basis.boundary``, 1.5 times as wide as the box, with the same centre.
     Beyond it the field is its mirror image with the sign reversed, and means nothing:
-    ``basis.share_beyond(x)`` tells how many states lie there.
+    `pymc_statespace_filters.field` warns of states that lie there.
 
     In the box the standard deviation of the field is that of the kernel, within 2 %, for lengths up
     to a third of half the box, and with enough sines: at ``basis.shortest_length`` they hold 90 %

@@ -139,15 +139,6 @@ def test_a_field_of_a_state_that_is_seen_is_bayesian_regression():
     assert log_evidence == pytest.approx(right, abs=1e-8)
 
 
-def test_the_share_of_states_beyond_the_boundary():
-    basis = gaussian_process_terms(["v", "w"], [(-2, 2), (0, 2)], 3)
-    x = np.array([[0, 3.1, -2.9, 0], [0, 0, 2.6, 2.4]])
-    assert basis.share_beyond(x) == 0.5
-    assert gaussian_process_terms("v", (-2, 2), 3).share_beyond([[0.0, 4.0], [1.0, -1.0]]) == 0.25
-    with pytest.raises(ModelError, match=r"x must hold the states \['v', 'w'\], got shape \(3,\)"):
-        basis.share_beyond([0.0, 1.0, 2.0])
-
-
 @pytest.mark.parametrize(
     ("states", "box", "n", "settings", "message"),
     [

@@ -1,13 +1,14 @@
 """What `compare_evidence` says of its numbers: sentences, and the column of errors of the step."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from ...errors import ModelError
+from ...tables import joined, quoted
 from ..evidence import Evidence
 
 SIGNIFICANT = 2.0  # standard errors
@@ -127,17 +128,6 @@ def approximation(names: Sequence[str], n_models: int) -> Iterator[str]:
     yield (
         f"The likelihood of {of_whom} is a filter's approximation; se does not include its error."
     )
-
-
-def quoted(names: Iterable[str]) -> str:
-    """Names in quotes, joined."""
-    return joined([repr(name) for name in names])
-
-
-def joined(parts: list[str]) -> str:
-    """Join as in "a, b and c"."""
-    *others, last = parts
-    return f"{', '.join(others)} and {last}" if others else last
 
 
 def step_error_columns(step_errors: Any, names: Sequence[str]) -> pd.DataFrame:
