@@ -15,7 +15,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.designs.candidates import read_designs
-from pymc_statespace_filters.designs.rivals import read_rivals
+from pymc_statespace_filters.designs.rivals import _independent, read_rivals
 from pymc_statespace_filters.errors import DataMismatchError, ModelError, ModelWarning
 
 DECAY, NOISE, SENSORS = 0.8, 0.3, (0.5, 0.1)
@@ -214,6 +214,15 @@ def test_draws_of_a_posterior_take_the_place_of_the_prior():
     assert found.sentences[1] == (
         f"{n} of 4000 draws are used, evenly thinned; all are worth {n} independent ones."
     )
+
+
+def test_draws_that_make_records_are_of_all_chains():
+    """Fewer records than draws must not all be made by the first chain."""
+    given = np.random.default_rng(1).normal(size=(4, 500, 1))
+    found, *_ = _independent(given, 400, np.random.default_rng(2))
+    places = [int(np.flatnonzero(given.ravel() == x)[0]) for x in found.ravel()]
+    assert len(set(places)) == 400
+    assert np.bincount(np.array(places[:100]) // 500).min() > 10  # of 25, once in 10^4 seeds fewer
 
 
 def test_draws_may_be_those_by_another_filter():
