@@ -92,7 +92,7 @@ def identifiability(
         ``prior_sd``, ``posterior_sd``
             In this coordinate; of the posterior the mean.
         ``full_ratio``
-            The ratio by full posteriors of a few records.
+            The ratio by full posteriors of a few records; NaN if most of them failed.
 
         The attribute ``directions`` has the weak directions, and ``combinations`` what is
         determined in them.

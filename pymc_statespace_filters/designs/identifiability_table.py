@@ -17,6 +17,7 @@ from .weak_directions import (
 )
 
 DIFFERENT = 1.25  # factor between two ratios from which a posterior is not normal
+FEWEST_FULL = 3  # full posteriors that are compared; fewer scatter as much as they may differ
 NOTHING = 0.97  # ratio, from which a parameter is as uncertain as before
 
 Array = NDArray[np.float64]
@@ -87,9 +88,12 @@ class Expected(NamedTuple):
         return np.sqrt(np.diagonal(self.prior))
 
     def compared(self) -> tuple[int, Array, Array]:
-        """The number of full posteriors, their mean ratio (k,), and the expected one there."""
+        """The number of full posteriors, their mean ratio (k,), and the expected one there.
+
+        None where they are too few.
+        """
         passed = [i for i, sd in enumerate(self.full_sds) if sd is not None]
-        if not passed:
+        if len(passed) < FEWEST_FULL:
             return 0, np.full_like(self.prior_sd, np.nan), np.full_like(self.prior_sd, np.nan)
         full = np.mean([self.full_sds[i] for i in passed], axis=0)
         return len(passed), full / self.prior_sd, self.sds[passed].mean(axis=0) / self.prior_sd
@@ -159,17 +163,17 @@ def _of_parameters(
 
 
 def _of_full(expected: Expected, chosen: Columns) -> Iterator[str]:
-    n_full = len(expected.full_sds)
-    n_passed, full, predicted = expected.compared()
-    if n_passed < n_full:
+    n_full, n_failed = len(expected.full_sds), sum(sd is None for sd in expected.full_sds)
+    n_compared, full, predicted = expected.compared()
+    if n_failed:
         unchecked = (
-            " The ratios are those of normal posteriors, and not checked; that of the width of a "
-            "population is too large."
+            " The ratios are those of normal posteriors, and not checked; if a parameter is the "
+            "width of a population, its ratio is too large."
         )
         yield (
-            f"Importance sampling of the full posteriors of {n_full - n_passed} of {n_full} "
+            f"Importance sampling of the full posteriors of {n_failed} of {n_full} "
             "simulated records failed, as they are far from normal or have many parameters: "
-            "simulate some records, and sample their posteriors." + unchecked * (not n_passed)
+            "simulate some records, and sample their posteriors." + unchecked * (not n_compared)
         )
     differs = _differs(expected)
     texts = [
@@ -179,7 +183,7 @@ def _of_full(expected: Expected, chosen: Columns) -> Iterator[str]:
     ]
     if texts:
         yield (
-            f"The posteriors are not normal: by full posteriors of {n_passed} simulated records "
+            f"The posteriors are not normal: by full posteriors of {n_compared} simulated records "
             f"the ratio is {joined(texts)}."
         )
 

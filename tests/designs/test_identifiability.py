@@ -259,18 +259,23 @@ def test_width_of_a_population_needs_full_posteriors():
 
 
 def test_without_full_posteriors_the_ratios_are_called_unchecked():
-    """As of a panel of sixty, where importance sampling fails."""
+    """As of a panel of sixty, where importance sampling fails; two posteriors tell too little."""
     covs = np.diag([0.99, 0.5])[None] ** 2
-    expected = Expected(
-        ["tau", "level"], np.array(["log", "value"]), np.eye(2), covs[[0, 0]], [None]
-    )
+    passed = [np.array([0.3, 0.2])] * 2
+    labels, kinds = ["tau", "level"], np.array(["log", "value"])
+    expected = Expected(labels, kinds, np.eye(2), covs[[0] * 4], [None, None, *passed])
     assert table_of(expected, np.arange(2), []).sentences == (
         "If posteriors are normal, the data say nothing of tau.",
         "If posteriors are normal, the data say little of level: 50 % of its prior remains.",
-        "Importance sampling of the full posteriors of 1 of 1 simulated records failed, as they "
+        "Importance sampling of the full posteriors of 2 of 4 simulated records failed, as they "
         "are far from normal or have many parameters: simulate some records, and sample their "
-        "posteriors. The ratios are those of normal posteriors, and not checked; that of the width "
-        "of a population is too large.",
+        "posteriors. The ratios are those of normal posteriors, and not checked; if a parameter "
+        "is the width of a population, its ratio is too large.",
+    )
+    enough = expected._replace(full_sds=[None, *passed, passed[0]])
+    assert table_of(enough, np.arange(2), []).sentences[-1] == (
+        "The posteriors are not normal: by full posteriors of 3 simulated records the ratio is of "
+        "tau 0.3 instead of 0.99 and of level 0.2 instead of 0.5."
     )
 
 
