@@ -7,10 +7,13 @@ import pymc as pm
 import pytensor
 import xarray as xr
 from numpy.typing import NDArray
+from pytensor.graph.traversal import ancestors
 from scipy.spatial import cKDTree
 
+from ..pymc_model.at_points import GraphsAtPoints
+from ..pymc_model.posterior_draws import unconstrained_draws
 from ..pymc_model.state_space_variable import observed_variables
-from ..system.gaussian_process_terms import GaussianProcessTerms
+from ..system.gaussian_process_terms import KERNEL_LENGTHS, GaussianProcessTerms
 from ..system.term_library import TermLibrary
 from .draws import SAMPLE_DIMS
 from .groups import state_dims
@@ -66,6 +69,17 @@ def prior_draws(model: pm.Model, name: str, rng: np.random.Generator) -> Array |
     except NotImplementedError:  # of pm.Flat
         return None
     return np.asarray(drawn, dtype=np.float64)
+
+
+def kernel_lengths(model: pm.Model, name: str, idata: xr.DataTree) -> Array | None:
+    """The length (draws, states) of the kernel by which `prior_sd` made the coefficients' prior."""
+    if name not in model.named_vars:
+        return None
+    lengths = [one for one in ancestors([model[name]]) if one.name == KERNEL_LENGTHS]
+    if len(lengths) != 1:
+        return None
+    [at_draws] = GraphsAtPoints(model, lengths)(unconstrained_draws(idata, model, least=1))
+    return at_draws.reshape(-1, at_draws.shape[-1])
 
 
 def standard_deviation(draws: Array | None, basis: Terms, points: Array) -> Array:

@@ -21,6 +21,7 @@ from .estimation import smoothed_states
 from .field_values import (
     Array,
     Terms,
+    kernel_lengths,
     moments_of,
     paths_of,
     prior_draws,
@@ -30,6 +31,7 @@ from .field_values import (
 
 _N_POINTS = {1: 101, 2: 41, 3: 21}  # of the grid along each state
 _N_JUDGED = 200  # visited states at which the field is compared with its prior
+_SHORT = 0.1  # of the draws, with lengths that the terms cannot follow
 _LEAST_TOLD = 0.9  # of the prior sd, above which the record has said next to nothing
 _NAMES = {"mean", "sd", "low", "high", "prob_positive", "prior_sd", "near", "visited", "visit",
           "visited_state"}  # fmt: skip
@@ -106,8 +108,9 @@ def field(
     Warns
     -----
     ModelWarning
-        If states leave the boundary of the basis; if the field is about as uncertain as before the
-        record; or if no system has the states of the terms, so that there are no visited ones.
+        If states leave the boundary of the basis; if the length of its kernel is shorter than its
+        terms can follow; if the field is about as uncertain as before the record; or if no system
+        has the states of the terms, so that there are no visited ones.
 
     See Also
     --------
@@ -174,7 +177,10 @@ def field(
         judged = visited[np.linspace(0, len(visited) - 1, min(_N_JUDGED, len(visited))).astype(int)]
         doubts = [
             f"{name}: {doubt}"
-            for doubt in _doubts(coefficients[name], prior, basis, paths, judged.T)
+            for doubt in (
+                *_doubts(coefficients[name], prior, basis, paths, judged.T),
+                *_doubts_of_lengths(basis, kernel_lengths(model, name, idata)),
+            )
         ]
         for doubt in doubts:
             warnings.warn(doubt, ModelWarning, skip_file_prefixes=INSIDE)
@@ -296,4 +302,20 @@ def _doubts(
             " record says next to nothing of it, so that the field is its prior. Noise hides it, or"
             f" the record is too short for {len(basis)} terms: measure longer, with a stronger "
             "excitation or less noise, or give the field a longer length"
+        )
+
+
+def _doubts_of_lengths(basis: Terms, lengths: Array | None) -> Iterator[str]:
+    """Whether the draws have lengths of the kernel (draws, states) that the terms cannot follow."""
+    if lengths is None or not isinstance(basis, GaussianProcessTerms):
+        return
+    shortest = basis.shortest_length
+    share = (lengths < shortest).any(axis=1).mean()
+    if share > _SHORT:
+        needed = np.ceil(basis.n * np.maximum(shortest / np.quantile(lengths, 0.05, axis=0), 1))
+        yield (
+            f"in {share:.0%} of the draws the length of the kernel is below "
+            f"{shortest.round(3).tolist()}, the shortest that {list(basis.n)} sines can follow, so "
+            f"that the field is smoother than these lengths say: take "
+            f"n={needed.astype(int).tolist()}, or a prior of the length that begins there"
         )

@@ -27,7 +27,9 @@ from .checks import check_count, check_floats
 from .equations import as_symbol, static_shape
 from .term_library import split_states, state_names
 
-__all__ = ["GaussianProcessTerms", "gaussian_process_terms"]
+__all__ = ["KERNEL_LENGTHS", "GaussianProcessTerms", "gaussian_process_terms"]
+
+KERNEL_LENGTHS = "lengths of the kernel"  # the name by which `field` finds them in a model
 
 # Half the domain, in halves of the box: for the kernels of Matern what Riutort-Mayol et al. (2023)
 # recommend at a length of a third of half the box.
@@ -118,7 +120,7 @@ class GaussianProcessTerms:
         lengths = as_symbol("lengthscale", lengthscale)
         amplitude = as_symbol("amplitude", amplitude)
         self._check_prior(lengths, amplitude)
-        lengths = pt.broadcast_to(lengths, (d,))
+        lengths = pt.broadcast_to(lengths, (d,)).copy(name=KERNEL_LENGTHS)
         frequencies = np.array(list(self._half_waves())) * self._slowest()
         squares = pt.sum((frequencies * lengths) ** 2, axis=1)
         if math.isinf(nu):

@@ -1,5 +1,6 @@
 """The candidates: which scalars of a model vanish together, and at which values."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -41,8 +42,18 @@ class Candidates:
 
     @property
     def labels(self) -> list[str]:
-        """Their names in results."""
-        return [key if isinstance(key, str) else ", ".join(key) for key in self.keys]
+        """Their names in results: a tuple that has all elements of a variable has its name."""
+        sizes = Counter(self.elements.variables)
+        found = []
+        for own in map(np.ndarray.tolist, self.switches.columns):
+            variables = [self.elements.variables[column] for column in own]
+            whole = {name for name, n in Counter(variables).items() if 1 < n == sizes[name]}
+            names = (
+                name if name in whole else self.elements.labels[column]
+                for name, column in zip(variables, own, strict=True)
+            )  # fmt: skip
+            found.append(", ".join(dict.fromkeys(names)))
+        return found
 
     @property
     def variables(self) -> list[str]:

@@ -95,6 +95,16 @@ def test_draws_of_both_orders_give_the_same_evidence(exchangeable):
     assert found.log_evidence == pytest.approx(TRUTH, abs=4 * found.se + 1e-3)
 
 
+@pytest.mark.parametrize("stays", [False, True])
+def test_so_many_labels_that_no_draws_visit_all_orders(stays):
+    """Seven alike have 5040 orders: draws are doubted if they stay in one, not otherwise."""
+    with pm.Model() as model:
+        pm.Normal("z", 0, 1, shape=7)
+    z = np.random.default_rng(3).normal(size=(4, 500, 7))
+    idata = tree(z=np.sort(z) if stays else z)
+    check(model, idata, "z" if stays else "", 7, ["z"])
+
+
 def test_labels_that_are_none():
     means = (-1.0, 1.5)
     idata = draws_of(log_joint(means))

@@ -1,9 +1,12 @@
 """Fields at draws of their coefficients, against the closed form of a Bayesian regression."""
 
+from contextlib import nullcontext
+
 import arviz as az
 import numpy as np
 import pymc as pm
 import pytest
+import xarray as xr
 from scipy.stats import norm
 
 import pymc_statespace_filters as psf
@@ -23,7 +26,7 @@ def sines(states, box, n):
     return np.sqrt(2 / (high - low)) * np.sin(np.pi * j * (states - low) / (high - low))
 
 
-def of_one_state(basis=BASIS, states=("z",), noise=NOISE):
+def of_one_state(basis=BASIS, states=("z",), noise=NOISE, length=LENGTH):
     """A record of a double well, seen with hardly any noise; its field and friction unknown."""
     system = psf.StateSpaceModel(
         states=list(states),
@@ -36,7 +39,9 @@ def of_one_state(basis=BASIS, states=("z",), noise=NOISE):
         shapes={"c": (len(basis),)},
     )
     with pm.Model() as model:
-        pm.Normal("c", 0, basis.prior_sd(LENGTH, AMPLITUDE), shape=len(basis))
+        if length is None:
+            length = pm.HalfNormal("length", 2.0)
+        pm.Normal("c", 0, basis.prior_sd(length, AMPLITUDE), shape=len(basis))
         psf.StateSpace("d", system, psf.EKF(), steps=np.arange(len(RECORD)), observed=RECORD)
     return model
 
@@ -177,6 +182,22 @@ def test_what_the_result_does_not_mean_is_said(model):
         found = psf.field(exact, model, terms={"c": other}, n_draws=1)
     assert found["c"]["near"].isnull().all()
     assert found["c"]["visited"].shape == (0, 1)
+
+
+@pytest.mark.parametrize(("length", "said"), [(0.5, True), (0.8, False)])
+def test_lengths_that_the_terms_cannot_follow_are_said(length, said):
+    """A fifth of the draws has this length; the shortest of six sines is 0.75."""
+    idata = draws_of(*regression(RECORD))
+    idata["posterior"]["length"] = xr.full_like(
+        idata["posterior"]["c"].isel(c_dim_0=0, drop=True), 2.0
+    )
+    idata["posterior"]["length"][:, ::5] = length
+    expected = (
+        r"c: in 20% of the draws the length of the kernel is below \[0\.749\], the shortest that "
+        r"\[6\] sines can follow, so .*: take n=\[9\], or a prior"
+    )
+    with pytest.warns(ModelWarning, match=expected) if said else nullcontext():
+        psf.field(idata, of_one_state(length=None), terms={"c": BASIS}, n_draws=1)
 
 
 @pytest.mark.parametrize(

@@ -93,6 +93,15 @@ def test_a_candidate_is_named_by_its_own_label():
     assert candidates.numbers("b[1]", "inclusion") == [0]
 
 
+def test_a_candidate_with_a_whole_vector_is_named_by_it():
+    with pm.Model() as model:
+        pm.HalfNormal("amplitude", 1)
+        pm.Normal("z", 0, 1, shape=3)
+        pm.Normal("b", 0, 1, shape=2)
+    candidates = read_candidates(model, {("amplitude", "z", "b[1]"): (0.0, 0.0, 0.0)})
+    assert candidates.labels == ["amplitude, z, b[1]"]
+
+
 class Scripted:
     """A sampler whose points have given log weights, one list for each time they are drawn."""
 
