@@ -20,7 +20,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import pymc as pm
 import pytensor.tensor as pt
+from pymc.logprob.transforms import LogTransform
 from pytensor.graph.basic import Apply, Constant, Variable
 from pytensor.graph.traversal import applys_between
 from pytensor.scalar.basic import Add, Exp, Identity, Mul, Neg, Pow, Sub, TrueDiv
@@ -53,6 +55,22 @@ class Centring(NamedTuple):
     def replaced(self) -> dict[TensorVariable, TensorVariable]:
         """What to replace in a graph, so that it depends on c instead of v."""
         return {self.value: (self.centred - self.location) / self.scale, **self.entries}
+
+
+class _Place(NamedTuple):
+    """Where a distribution has its location among its parameters, with the scale behind it."""
+
+    number: int
+    transform: type = type(None)  # of the variable, whose value has them
+
+
+_LOCATIONS = {
+    type(pm.Normal.rv_op): _Place(0),
+    type(pm.LogNormal.rv_op): _Place(0, LogTransform),
+    type(pm.Laplace.rv_op): _Place(0),
+    type(pm.Logistic.rv_op): _Place(0),
+    type(pm.StudentT.rv_op): _Place(1),
+}
 
 
 class _Affine(NamedTuple):
@@ -128,6 +146,26 @@ def centring_of(
         scale = scale[:, column].set(part.scale)
         entries[part.graph] = part.at(centred[:, column])
     return Centring(value, centred, location, scale, entries)
+
+
+def centred_by_prior(
+    value: TensorVariable, model: pm.Model, point: Mapping[str, Any]
+) -> Centring | None:
+    """The coordinates that a value has in the model, if its prior has a location and a scale.
+
+    v is then a standard variable, on which no parameter of the population depends. A centred value
+    of `centring_of` is none of the model, and its v has a prior without parameters.
+    """
+    rv = model.values_to_rvs.get(value)
+    place = _LOCATIONS.get(type(rv.owner.op)) if rv is not None else None
+    if place is None or type(model.rvs_to_transforms[rv]) is not place.transform:
+        return None
+    of_prior = rv.owner.op.dist_params(rv.owner)[place.number : place.number + 2]
+    location, scale = (
+        pt.broadcast_to(number, np.shape(point[value.name]))
+        for number in model.replace_rvs_by_values(of_prior)
+    )
+    return Centring(value, value, location, scale, {})
 
 
 def _clients(value: Variable, graphs: Sequence[Variable]) -> Clients:

@@ -13,7 +13,8 @@ shared
     All others. A variable of which it is not certain that it is own is shared.
 
 Own variables are moved in coordinates in which the likelihoods depend on fewer of the others, where
-there are such: see `centring`.
+there are such: see `centring`. Those of the centred form have such already, and their priors tell
+in which others they would be non-centred.
 """
 
 from collections import ChainMap
@@ -31,7 +32,7 @@ from pytensor.tensor.elemwise import CAReduce
 from pytensor.tensor.variable import TensorVariable
 
 from .aligned_axes import Aligned, Mixed, Status, follow, records_of_rows
-from .centring import Centring, centring_of
+from .centring import Centring, centred_by_prior, centring_of
 from .inspection import log_density_terms, panel_variables, state_space_nodes
 
 
@@ -47,11 +48,17 @@ class PanelStructure(NamedTuple):
     population: tuple[TensorVariable, ...]
     shared: tuple[TensorVariable, ...]
     centrings: tuple[Centring, ...]  # of own values, which the graphs then do not have
-    interwoven: tuple[TensorVariable, ...]  # of the others, those of which centrings are made
+    centred: tuple[Centring, ...]  # of own values, which have these coordinates in the model
     likelihood: TensorVariable  # (G,), of the panels
     other_likelihood: TensorVariable | None  # (), of other data, if filters compute one
     prior: TensorVariable  # (G,), all other terms that own variables touch
     rest: TensorVariable  # (), all terms that are left
+
+    @property
+    def interwoven(self) -> list[TensorVariable]:
+        """Of the values that records share, those of which locations and scales are made."""
+        made_of = _made_of([*self.centrings, *self.centred])
+        return [value for value in (*self.population, *self.shared) if value in made_of]
 
 
 class _Terms(NamedTuple):
@@ -105,8 +112,8 @@ def panel_structure(model: pm.Model, *, centres: bool = True) -> PanelStructure 
     if centrings:
         terms = _centred(terms, centrings, n_records, point)
         assert not terms.mixed  # as entries keep their rows
+    centred = _centred_in_model(model, terms.own, common, point) if centres else []
     reached = set(ancestors(terms.likelihoods))
-    of_centrings = set(ancestors([at for one in centrings for at in (one.location, one.scale)]))
     likelihoods, other_likelihoods = _divided(terms.likelihoods, terms.status, n_records)
     priors, rest = _divided(terms.others, terms.status, n_records)
     return PanelStructure(
@@ -116,7 +123,7 @@ def panel_structure(model: pm.Model, *, centres: bool = True) -> PanelStructure 
         tuple(value for value in common if value not in reached),
         tuple(value for value in common if value in reached),
         tuple(centrings),
-        tuple(value for value in common if value in of_centrings),
+        tuple(centred),
         _total(likelihoods, pt.zeros(n_records)),
         _total(other_likelihoods, pt.zeros(())) if other_likelihoods else None,
         _total(priors, pt.zeros(n_records)),
@@ -160,6 +167,27 @@ def _centrings(
     return [
         one for one in found if reached([other for other in found if other is not one]) != fewest
     ]
+
+
+def _centred_in_model(
+    model: pm.Model,
+    own: Sequence[TensorVariable],
+    common: Sequence[Variable],
+    point: Mapping[str, Any],
+) -> list[Centring]:
+    """Of the own values those with priors of locations and scales that all records share."""
+    found = (centred_by_prior(value, model, point) for value in own)
+    among, others = set(common), {*model.value_vars} - {*common}
+    return [
+        one
+        for one in found
+        if one is not None and among & (made_of := _made_of([one])) and not others & made_of
+    ]
+
+
+def _made_of(centrings: Sequence[Centring]) -> set[Variable]:
+    """What locations and scales depend on."""
+    return set(ancestors([at for one in centrings for at in (one.location, one.scale)]))
 
 
 def _replaced(

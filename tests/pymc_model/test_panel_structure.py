@@ -282,6 +282,59 @@ def function_of(values, graphs):
     return lambda point: function(*(point[value.name] for value in values))
 
 
+def centred_log():
+    mu, sd = pm.Normal("mu"), pm.HalfNormal("sd")
+    panel(rate=0.3, level=pm.LogNormal("x", mu * np.arange(3.0), sd, dims="machine"))
+
+
+def centred_heavy():
+    mu, sd = pm.Normal("mu", shape=2), pm.HalfNormal("sd")
+    x = pm.StudentT("x", 4, mu=mu, sigma=sd, dims=("machine", "of"))
+    panel(rate=0.3 + 0.1 * pm.math.tanh(x[:, 0]), level=x[:, 1])
+
+
+def nested():
+    """Of the two the second one has the first as its location, which records do not share."""
+    mu, sd = pm.Normal("mu"), pm.HalfNormal("sd")
+    y = pm.Normal("y", mu, sd, dims="machine")
+    panel(rate=0.3, level=pm.Normal("x", y, sd, dims="machine"))
+
+
+def transformed():
+    mu = pm.Normal("mu")
+    panel(rate=0.3, level=pm.Normal("x", mu, 1, dims="machine", transform=IN_A_THIRD))
+
+
+IN_A_THIRD = pm.distributions.transforms.Interval(-1, 2)
+
+
+@pytest.mark.parametrize(
+    ("form", "name"),
+    [(centred, "x"), (centred_log, "x"), (centred_heavy, "x"), (nested, "y"), (regression, None),
+     (transformed, None), (bounded_by_population, None), (non_centred, None)],
+    ids=lambda one: getattr(one, "__name__", ""),
+)  # fmt: skip
+def test_the_standard_values_of_centred_ones(form, name):
+    """Their prior does not depend on locations and scales."""
+    model = model_of(form)
+    found = panel_structure(model)
+    assert [model.values_to_rvs[one.value].name for one in found.centred] == [name] * bool(name)
+    if name is None:
+        return
+    assert found.interwoven
+    (one,) = found.centred
+    prior = model.logp(vars=[model[name]]) - one.log_jacobian.sum()
+    evaluate = function_of(model.value_vars, [one.location, one.scale, prior])
+    point, numbers = model.initial_point(random_seed=0), []
+    for shift in (0.0, 0.3):
+        here = point | {v.name: point[v.name] + shift for v in found.interwoven}
+        location, scale, _ = evaluate(here)
+        value = location + scale * np.linspace(-1, 1.5, scale.size).reshape(scale.shape)
+        numbers.append(evaluate(here | {one.value.name: value})[2])
+    assert numbers[0] == pytest.approx(numbers[1], rel=1e-12)
+    assert panel_structure(model, centres=False).interwoven == []
+
+
 def point_in_model(model, centrings, point):
     """The point in the coordinates of the model, and the log-Jacobian of those by differences."""
     values = [one.replaced[one.value] for one in centrings]

@@ -101,13 +101,23 @@ def test_exact_posterior(filter, centred):
     assert ("shared_accepted" in stats, "population_accepted" in stats) == (False, True)
 
 
-@pytest.mark.parametrize("filter", [psf.EKF(), NOISY], ids=["EKF", "BootstrapPF"])
-def test_a_spread_of_random_effects_by_quadrature(filter):
-    """Twelve comparisons at 4.5 standard errors, two cases: one false alarm in 6000 seeds."""
+@pytest.mark.parametrize(
+    ("filter", "form"),
+    [(psf.EKF(), "non-centred"), (NOISY, "non-centred"), (psf.EKF(), "Normal"),
+     (psf.EKF(), "LogNormal")],
+    ids=["EKF", "BootstrapPF", "centred", "centred_log"],
+)  # fmt: skip
+def test_a_spread_of_random_effects_by_quadrature(filter, form):
+    """Twelve comparisons at 4.5 standard errors, four cases: one false alarm in 3000 seeds."""
     labels = ["a", "b", "c", "d"]
     with pm.Model(coords={"place": labels}) as model:
         mu, sd = pm.Normal("mu", 0.0, PRIOR_SD), pm.HalfNormal("sd", 1.0)
-        z = pm.Normal("z", dims="place")
+        if form == "non-centred":
+            level = mu + sd * pm.Normal("z", dims="place")
+        elif form == "Normal":
+            level = pm.Normal("level", mu, sd, dims="place")
+        else:
+            level = pm.math.log(pm.LogNormal("exp_level", mu, sd, dims="place"))
         psf.StateSpace(
             "d",
             SYSTEM,
@@ -115,12 +125,20 @@ def test_a_spread_of_random_effects_by_quadrature(filter):
             panel=np.repeat(labels, N_ROWS),
             steps=np.tile(np.arange(1, N_ROWS + 1), len(labels)),
             observed=data_of(len(labels)),
-            params={"level": mu + sd * z},
+            params={"level": level},
         )
-    posterior = chains(model, 3000)["posterior"]
+    idata = chains(model, 3000)
+    if form != "non-centred":  # the records, and all of them once more with the standard values
+        assert (idata["sample_stats"]["n_evaluations"] == 2 * len(labels)).all()
+    posterior = idata["posterior"]
     expected = of_random_effects(data_of(len(labels)).reshape(-1, N_ROWS).mean(axis=1))
-    drawn = [posterior["mu"].values, posterior["sd"].values]
-    drawn += [drawn[0] ** 2, drawn[1] ** 2, *np.moveaxis(posterior["z"].values, -1, 0)]
+    mu, sd = posterior["mu"].values, posterior["sd"].values
+    if form == "non-centred":
+        z = posterior["z"].values
+    else:
+        levels = np.log(posterior["exp_level"]) if form == "LogNormal" else posterior["level"]
+        z = (levels.values - mu[..., None]) / sd[..., None]
+    drawn = [mu, sd, mu**2, sd**2, *np.moveaxis(z, -1, 0)]
     for draws, mean in zip(drawn, expected, strict=True):
         assert abs(draws.mean() - mean) < 4.5 * az.mcse(draws, method="mean")
 

@@ -55,7 +55,10 @@ class RecordLayout(NamedTuple):
     own: np.ndarray  # int64 (G, k): places of a record's own parameters
     shared: np.ndarray  # int64 (s,)
     population: np.ndarray  # int64 (p,)
-    centred: np.ndarray  # int64 (c,): places where a state has location + scale * value
+    # int64 (c,): places where a state has location + scale * value. The first n_standard are of
+    # variables that are that value in the model, the others of variables that are as in the state.
+    centred: np.ndarray
+    n_standard: int
     interwoven: np.ndarray  # int64 (i,): of what locations and scales are made; of other blocks too
     # int64 (G, panels): places of the seeds of a record's estimate in those of a state
     seeds: np.ndarray
@@ -183,20 +186,21 @@ def evaluate_priors(density, priors):
 
 
 @njit_cached
-def write_in_model(density, layout, state, position):
-    """Write the position of a state in the coordinates of the model.
+def write_standard(density, layout, state, position, n_standard):
+    """Write the position of a state with so many of the centred places as the values behind them.
 
-    Returns the log-Jacobian of those of the state; NaN if the model raised.
+    With ``layout.n_standard`` the coordinates are those of the model. Returns the log-Jacobian of
+    those of the state; NaN if the model raised.
     """
     copy_into(position, state.position)
-    n = layout.centred.size
-    if n == 0:
+    if n_standard == 0:
         return 0.0
     copy_into(density.position, state.position)
     if not make_call(density.prior):
         return np.nan
+    n = layout.centred.size
     first, log_jacobian = 1 + layout.own.shape[0] + 1, 0.0
-    for i in range(n):
+    for i in range(n_standard):
         place, scale = layout.centred[i], density.prior.out[first + n + i]
         position[place] = (state.position[place] - density.prior.out[first + i]) / scale
         log_jacobian -= np.log(np.abs(scale))
@@ -204,18 +208,18 @@ def write_in_model(density, layout, state, position):
 
 
 @njit_cached
-def centre(density, layout):
-    """Give the position in the arrays, one of the model, the coordinates of a state, in place.
+def centre(density, layout, n_standard):
+    """Give the position in the arrays, of `write_standard`, the coordinates of a state.
 
-    Returns as `write_in_model`. Locations and scales depend on no centred place.
+    Returns as `write_standard`. Locations and scales depend on no centred place.
     """
-    n = layout.centred.size
-    if n == 0:
+    if n_standard == 0:
         return 0.0
     if not make_call(density.prior):
         return np.nan
+    n = layout.centred.size
     first, log_jacobian = 1 + layout.own.shape[0] + 1, 0.0
-    for i in range(n):
+    for i in range(n_standard):
         place, scale = layout.centred[i], density.prior.out[first + n + i]
         density.position[place] = density.prior.out[first + i] + scale * density.position[place]
         log_jacobian -= np.log(np.abs(scale))

@@ -21,7 +21,9 @@ those of c_g, whose density has the factor 1 / |b|; draws are recorded as x_g. T
 data of each record say more about c_g than the population does. If they say less, x_g is nearly
 independent of a and b, and c_g is not. So there is a fourth move, of the same posterior: what a and
 b are made of is proposed at the same x_g, which changes all L_g, as the shared block does. Chains
-that move in the one and the other coordinates in turn mix about as well as in the better ones.
+that move in the one and the other coordinates in turn mix about as well as in the better ones. The
+fourth move is made, too, where c_g is a variable of the model and a and b are the location and the
+scale of its prior; draws are then recorded as c_g.
 
 Every estimate belongs to the point at which it was made, and is kept until its record moves or the
 shared block does. The noise of the records is independent, so that each move is one of Andrieu and
@@ -51,7 +53,7 @@ from .record_arrays import (
     centre,
     evaluate_likelihoods,
     evaluate_priors,
-    write_in_model,
+    write_standard,
 )
 from .state import (
     ACCEPTANCE,
@@ -216,16 +218,17 @@ def _move_shared(settings, density, layout, state, random, k, terms, counts):
 
 @_internal
 def _move_interwoven(settings, density, layout, state, random, k, terms, counts):
-    """What locations and scales are made of moves at the same values of the model."""
+    """What locations and scales are made of moves at the same standard values."""
     estimates, priors, new_estimates, new_priors = terms
     n_records, block = layout.own.shape[0], layout.interwoven
     first = state.adaptation.size - packed_size(block.size)
     adaptation = unpack(state.adaptation[first:], block.size)
-    in_model = np.empty(state.position.size)
-    jacobian = write_in_model(density, layout, state, in_model)
+    standard = np.empty(state.position.size)
+    n_standard = layout.centred.size
+    jacobian = write_standard(density, layout, state, standard, n_standard)
     _propose(state, density, block, adaptation.chol, random.interwoven[k])
-    _take_block(density.position, in_model, layout.centred)
-    new_jacobian = centre(density, layout)
+    _take_block(density.position, standard, layout.centred)
+    new_jacobian = centre(density, layout, n_standard)
     copy_into(density.seeds, random.seeds[k, -1])
     found = evaluate_likelihoods(density, new_estimates)
     _count(counts, found, n_records)
@@ -316,7 +319,9 @@ def advance_records(settings, density, layout, state, random, first, draws, row,
             _move_population(settings, density, layout, state, random, k, terms, counts)
         if counts[FAILURE] == RAISED:
             break
-        log_jacobian = write_in_model(density, layout, state, draws.positions[at])
+        log_jacobian = write_standard(
+            density, layout, state, draws.positions[at], layout.n_standard
+        )
         state.numbers[LOG_DENSITY] = _total(estimates, priors) - log_jacobian
         copy_into(draws.seeds[at], state.seeds)
         numbers[LOG_DENSITY] = state.numbers[LOG_DENSITY]

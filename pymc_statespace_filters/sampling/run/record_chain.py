@@ -13,7 +13,7 @@ from ..kernel.record_arrays import (
     FIRST_ESTIMATE,
     RecordEvaluation,
     RecordRandomBlock,
-    write_in_model,
+    write_standard,
 )
 from ..kernel.record_moves import advance_records
 from ..kernel.state import (
@@ -168,7 +168,8 @@ class RecordChain(ChainArrays):
     def position(self) -> np.ndarray:
         """Where the chain is, in the coordinates of the model."""
         position = np.empty_like(self.state.position)
-        write_in_model(self._densities.native, self._target.layout, self.state, position)
+        layout = self._target.layout
+        write_standard(self._densities.native, layout, self.state, position, layout.n_standard)
         return position
 
     @property

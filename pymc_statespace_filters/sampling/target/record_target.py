@@ -66,8 +66,8 @@ class RecordDensities:
     ):
         centrings = {one.value: one for one in structure.centrings}
         variables = [centrings[v].centred if v in centrings else v for v in variables]
-        locations = [one.location for one in structure.centrings]
-        scales = [one.scale for one in structure.centrings]
+        both = [*structure.centrings, *structure.centred]
+        locations, scales = [one.location for one in both], [one.scale for one in both]
         other = structure.other_likelihood
         likelihoods = [structure.likelihood, pt.zeros(()) if other is None else other]
         healths = health_outputs(likelihoods)
@@ -149,7 +149,7 @@ class BoundRecordDensities:
         """A position of the model in the coordinates of these densities; an exception is raised."""
         self.native.position[:] = position
         with held_interrupts():
-            log_jacobian = centre(self.native, layout)
+            log_jacobian = centre(self.native, layout, layout.n_standard)
         if np.isnan(log_jacobian):
             self.raise_error()
         return self.native.position.copy()
@@ -199,6 +199,8 @@ class RecordTarget(SampledModel):
     ):
         _check_settings(settings, structure.name)
         super().__init__(model, None, settings)
+        if self._seeds:  # the noise of all estimates would reject nearly every interwoven move
+            structure = structure._replace(centred=())
         self.structure = structure
         self.labels = tuple(model.coords[f"{structure.name}_record"])
         self.layout = self._layout(model)
@@ -224,11 +226,13 @@ class RecordTarget(SampledModel):
                 of_records.append(len(columns) + np.arange(n_records))
             columns += [column] * n_seeds
         seeds = np.array(of_records, dtype=np.int64).reshape(-1, n_records).T
+        standard = _joined([places[one.value.name] for one in structure.centrings])
         return RecordLayout(
             np.concatenate([places[v.name].reshape(n_records, -1) for v in structure.own], axis=1),
             _joined([places[v.name] for v in structure.shared]),
             _joined([places[v.name] for v in structure.population]),
-            _joined([places[one.value.name] for one in structure.centrings]),
+            np.concatenate([standard, _joined([places[v.value.name] for v in structure.centred])]),
+            len(standard),
             _joined([places[v.name] for v in structure.interwoven]),
             np.ascontiguousarray(seeds),
             np.array(columns, dtype=np.int64),
