@@ -21,6 +21,7 @@ MOST_APART, LEAST_APART = 4.0, 0.02  # of visits and probabilities: errors, and 
 # sub-models (`benchmarks.terms_poor_draws`).
 LEAST_OF_FULL = 5.0
 NEGLIGIBLE = 0.005  # probability of a single one
+MOST_SAMPLED = 2  # candidates whose sub-models may as well be sampled one by one
 N_COMPARED, SAME = 3, 1e-9  # draws at which terms are told apart; relative, of equal likelihoods
 
 
@@ -116,17 +117,9 @@ def doubts(
         yield (
             "the draws of idata do not seem to be from the posterior of this model, or are too "
             f"few: {full.count} points that were drawn like them are worth {full.n_effective:.1f} "
-            "draws of the posterior, and no better proposal was found. Give draws of psf.sample, "
-            "or a filter with more particles where the likelihood is noisy"
+            "draws of the posterior, and no better proposal was found. Give draws of psf.sample"
+            f"{_or_particles(points)}"
         )
-    advice = (
-        "the draws of the full model are no guide, as the data do not determine all of its "
-        "parameters: name fewer candidates, or compare the result with that of another random_seed"
-        if full is None
-        else "give more draws of the full model as idata, or a filter with more particles where "
-        "the likelihood is noisy; and what only one term uses, as a gap, together with it, as "
-        "('k', 'gap') in absent"
-    )
     poor = unreliable(found, points)
     share = float(found.of_models[poor].sum())
     if share > MAX_SHARE:
@@ -138,7 +131,7 @@ def doubts(
             f"{'few effective points' if few else 'weights with a heavy tail'}, such as "
             f"that with {', '.join(labels) or 'none of the terms'} (Pareto k "
             f"{points[worst].pareto_k:.2f}, {points[worst].n_effective:.0f} "
-            f"effective points): {advice}"
+            f"effective points): {_advice(points, candidates, full)}"
         )
     if visits is None:
         return
@@ -152,3 +145,29 @@ def doubts(
             f"give it the probability {found.inclusion[j]:.2f}: some that matter were not met; "
             "run again with another random_seed, or name fewer candidates"
         )
+
+
+def _advice(points: Sequence[Weighted], candidates: Candidates, full: Weighted | None) -> str:
+    """What helps where points of sub-models are worth little."""
+    if full is None:
+        return (
+            "the draws of the full model are no guide, as the data do not determine all of its "
+            "parameters: name fewer candidates, or compare the result with that of another "
+            "random_seed"
+        )
+    more = f"give more draws of the full model as idata{_or_particles(points)}"
+    if len(candidates) <= MOST_SAMPLED:
+        more += (
+            ", or sample the models with and without a term, and compare their evidences "
+            "(compare_evidence)"
+        )
+    if any(isinstance(key, str) for key in candidates.keys):
+        more += (
+            "; and what only one term uses, as a gap, together with it, as ('k', 'gap') in absent"
+        )
+    return more
+
+
+def _or_particles(points: Sequence[Weighted]) -> str:
+    """The remedy of noisy likelihoods, each point of which has a seed."""
+    return ", or a filter with more particles" if points[0].seeds.shape[1] else ""

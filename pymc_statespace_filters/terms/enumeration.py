@@ -10,13 +10,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from .candidates import Candidates
-from .doubts import check_finite
+from .doubts import NEGLIGIBLE, check_finite
 from .inclusion import InclusionPrior
 from .probabilities import Probabilities
 from .proposals import Guide
 from .screening import N_SCREENED, Announce, improved, screened
 from .submodel_density import Array, Sets
-from .submodel_evidence import Sampler, Weighted
+from .submodel_evidence import LEAST_EFFECTIVE, Sampler, Weighted
 
 FEWEST = 100  # points of a sub-model within reach
 LARGE, ENOUGH = (
@@ -51,7 +51,11 @@ def estimate_all(
     judged = list(found)
     for i, one in zip(within, pilots, strict=True):
         judged[i] = one
-    counts = np.maximum(_least(probabilities(judged, sets, log_prior)), FEWEST)[within]
+    known = probabilities(judged, sets, log_prior)
+    # A term that is certain moves with no evidence, but the error of this is told as well.
+    matter = known.of_models > NEGLIGIBLE
+    least = np.where(matter, [_enough_for_error(one) for one in judged], FEWEST)
+    counts = np.maximum(_least(known), least)[within]
     announce("sub-models within reach", int(counts.sum()))
     drawn = sampler.draw([one.proposal for one in pilots], counts.tolist())
     for i, one in zip(within, drawn, strict=True):
@@ -116,6 +120,17 @@ def with_lighter_tails(
     for (i, _), one in zip(good, fresh, strict=True):
         better[i] = one
     return better
+
+
+def _enough_for_error(pilot: Weighted) -> int:
+    """Points whose error can be believed, with some to spare, by what those of a pilot are worth.
+
+    At most as many as a sub-model with a large influence has.
+    """
+    effective = 2 * LEAST_EFFECTIVE
+    if not pilot.efficiency * ENOUGH > effective:
+        return ENOUGH
+    return max(FEWEST, int(np.ceil(effective / pilot.efficiency)))
 
 
 def _least(known: Probabilities) -> np.ndarray:

@@ -210,3 +210,28 @@ def test_advice_where_draws_are_no_guide():
     named = SimpleNamespace(labels=["b"])
     [doubt] = doubts(found, points, named, None, None)
     assert "the draws of the full model are no guide" in doubt
+
+
+@pytest.mark.parametrize("keys", [[("a", "b")], ["a", "b", "c"]])
+@pytest.mark.parametrize("is_noisy", [False, True])
+def test_advice_is_of_what_there_is(keys, is_noisy):
+    """Of particles, a few terms, and terms of one variable."""
+    present = np.ones((1, len(keys)), dtype=bool)
+    found = SimpleNamespace(of_models=np.array([1.0]), present=present)
+    seeds = np.zeros((9, int(is_noisy)))
+    point = SimpleNamespace(is_reliable=False, n_effective=30.0, pareto_k=0.3, seeds=seeds)
+    [doubt] = doubts(found, [point], Named(keys), None, point)
+    assert "give more draws of the full model" in doubt
+    assert ("particles" in doubt) == is_noisy
+    assert ("compare_evidence" in doubt) == (len(keys) == 1)
+    assert ("a gap" in doubt) == (len(keys) > 1)
+
+
+class Named(SimpleNamespace):
+    """Candidates by their names alone."""
+
+    def __init__(self, keys):
+        super().__init__(keys=keys, labels=["".join(key) for key in keys])
+
+    def __len__(self):
+        return len(self.keys)

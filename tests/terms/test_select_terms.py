@@ -10,7 +10,7 @@ import pymc as pm
 import pytest
 import xarray as xr
 from scipy.special import betaln, logsumexp
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, norm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
@@ -415,6 +415,26 @@ def test_a_slab_that_depends_on_another_candidate_keeps_its_width():
         truth = np.exp(logs - logsumexp(logs)) @ sets
         curve = found.sel(width=width)
         assert (abs(curve["width_prob"] - truth) < 4 * curve["width_se"]).all()
+
+
+def test_a_certain_term_has_an_evidence_that_is_not_doubted(recwarn):
+    """Of many coefficients: the points of the full model are worth a third, or less."""
+    n, rng = 12, np.random.default_rng(1)
+    y, sd = 40 + np.arange(n), (1 + 1 / 100) ** -0.5
+    with pm.Model() as model:
+        b = pm.Normal("b", 0, 10, shape=n)
+        pm.Normal("y", b, 1.0, observed=y)
+    # Wider than the posterior is.
+    draws = y * sd**2 + 1.3 * sd * rng.standard_normal((2, 1000, n))
+    idata = az.from_dict({"posterior": {"b": draws}})
+    found = psf.select_terms(
+        model, {("b",): 0.0}, idata=idata, inclusion=0.5, random_seed=1, progressbar=False
+    )["models"].to_dataset()
+    best = found.isel(model=0)
+    truth = norm(0, 101**0.5).logpdf(y).sum()
+    assert best["n_evaluations"] < 1000
+    assert abs(best["log_evidence"] - truth) < 4 * best["se"] < 0.6
+    assert not recwarn.list
 
 
 def test_noisy_likelihoods_have_the_evidences_of_exact_ones(monkeypatch):
