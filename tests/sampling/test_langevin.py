@@ -79,6 +79,18 @@ def test_curvature_gives_the_metric_of_few_points():
     assert curvature_factor(x * [1.0, 0.0], lambda x: -x) is None
 
 
+def test_curvature_at_several_points_is_averaged():
+    """3 x^2 of x^4 / 4 at 1 and 2, and 12 of the other; a point without a gradient is left out."""
+
+    def gradients(x):
+        return -np.stack([np.where(x[:, 0] < 3.0, x[:, 0] ** 3, np.nan), 12.0 * x[:, 1]], axis=1)
+
+    x = np.random.default_rng(7).standard_normal((8, 2))
+    chol = curvature_factor(x, gradients, np.array([[1.0, 5.0], [2.0, 0.0], [3.0, 0.0]]))
+    np.testing.assert_allclose(chol @ chol.T, [[1 / 7.5, 0.0], [0.0, 1 / 12]], rtol=1e-6)
+    assert curvature_factor(x, gradients, np.array([[3.0, 0.0]])) is None
+
+
 def test_few_points_settle_too():
     """128 in 60 dimensions: Kolmogorov-Smirnov at 0.1 %, as above."""
     mean, cov, evaluate = normal(dim=60)

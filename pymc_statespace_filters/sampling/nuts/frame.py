@@ -14,6 +14,9 @@ WithGradient = Callable[[Array], tuple[float, Array]]
 _MOST_POINTS = 512  # whose gradients are asked
 # Points per dimension; those of a walk in more than 128 dimensions depend on each other.
 _ENOUGH = 4
+# Points where curvature is asked. That at their mean alone may be a hundredth of what it is at
+# some of them, where a step that suits it diverges.
+_N_CURVED = 8
 
 
 class Frame(NamedTuple):
@@ -53,8 +56,8 @@ class Frame(NamedTuple):
 def frame_of(points: Array, evaluate: WithGradient, *, takes_curvature: bool) -> Frame:
     """The frame of points (m, d) of a posterior and their gradients, see `metric_factor`.
 
-    Where the points are too few, that of the curvature at their mean; without it, or where they do
-    not vary in every direction, that of their deviations.
+    Where the points are too few, that of the average curvature at some of them; without it, or
+    where they do not vary in every direction, that of their deviations.
     """
     x = points[:: -(-len(points) // _MOST_POINTS)]
 
@@ -63,7 +66,7 @@ def frame_of(points: Array, evaluate: WithGradient, *, takes_curvature: bool) ->
 
     factor, d = None, x.shape[1]
     if takes_curvature and len(x) < _ENOUGH * d:
-        factor = curvature_factor(x, gradients)
+        factor = curvature_factor(x, gradients, x[:: -(-len(x) // _N_CURVED)])
     elif len(x) >= PER_DIMENSION * d:
         found = gradients(x)
         known = np.isfinite(found).all(axis=1)

@@ -89,19 +89,25 @@ def metric_factor(x: Array, gradient: Array) -> Array | None:
     return _lower(points.chol @ (directions * widths) @ directions.T @ points.chol.T)
 
 
-def curvature_factor(x: Array, gradients: Callable[[Array], Array]) -> Array | None:
+def curvature_factor(
+    x: Array, gradients: Callable[[Array], Array], at: Array | None = None
+) -> Array | None:
     """Lower factor (k, k) of the inverse curvature at the mean of points (m, k).
 
-    ``gradients`` gives those of the log-density (n, k) at points (n, k). None if one is not finite,
-    or if the points do not vary in a coordinate.
+    Or of the average curvature ``at`` some points (n, k), without those where it is not finite.
+    ``gradients`` gives those of the log-density (n, k) at points (n, k). None if the curvature is
+    finite nowhere, or if the points do not vary in a coordinate.
     """
     spread, k = x.std(axis=0), x.shape[1]
+    at = x.mean(axis=0, keepdims=True) if at is None else at
     moves = np.diag(_OFFSET * spread)
-    found = gradients(np.concatenate([x.mean(axis=0) + moves, x.mean(axis=0) - moves]))
-    if not (np.isfinite(found).all() and (spread > 0.0).all()):
+    moved = np.stack([at[:, np.newaxis] + moves, at[:, np.newaxis] - moves])
+    found = gradients(moved.reshape(-1, k)).reshape(moved.shape)
+    found = found[:, np.isfinite(found).all(axis=(0, 2, 3))]
+    if not (found.size and (spread > 0.0).all()):
         return None
     # In units of the spread.
-    curvature = (found[:k] - found[k:]) * spread / (2 * _OFFSET)
+    curvature = (found[0] - found[1]).mean(axis=0) * spread / (2 * _OFFSET)
     values, directions = np.linalg.eigh(0.5 * (curvature + curvature.T))
     widths = np.maximum(np.abs(values), 1 / _MOST_WIDER) ** -0.5
     half = spread[:, np.newaxis] * directions * widths
