@@ -1,6 +1,9 @@
 """What is said at the end of a run of NUTS: each cause once, and the report."""
 
+from collections.abc import Sequence
+
 import numpy as np
+from scipy.special import ndtri
 
 from ..parallel.signals import is_interrupted
 from ..pymc_model.inspection import have_missing_codes
@@ -15,6 +18,8 @@ from .words import log, told
 # Bayesian fraction of missing information of the energies, below which the tails of one are too
 # long for its momenta (Betancourt 2016).
 _LEAST_E_BFMI = 0.3
+# Probability with which a variable is named for divergences that have nothing to do with any.
+_BY_CHANCE = 0.05
 
 
 @told.register
@@ -66,15 +71,15 @@ def _report(fact: EndedNuts) -> str:
 def _problems(fact: EndedNuts, instead: str) -> list[str]:
     diverging, e_bfmi = fact.diverging, _e_bfmi(fact)
     if fact.diverges:
-        return [
-            f"{int(diverging.sum())} of {diverging.size} draws diverged, most where "
-            f"{_neck(fact)}: "
-            f"{instead or 'reparametrise that variable'}."
-        ]
+        many = f"{int(diverging.sum())} of {diverging.size} draws diverged"
+        if neck := where_diverging(fact.names, fact.positions, diverging.ravel()):
+            return [f"{many}, most where {neck}: {instead or 'reparametrise that variable'}."]
+        missed = f"about {100 * diverging.mean():.2g} % of the posterior may be missing from them"
+        return [f"{many}, where no single variable is large or small: {instead or missed}."]
     if e_bfmi.min() < _LEAST_E_BFMI:
         return [
             f"E-BFMI is {e_bfmi.min():.2f} in chain {int(e_bfmi.argmin())}: the chains are slow "
-            f"along the log-density, as of {_neck(fact)}; reparametrise it."
+            f"along the log-density, as of {_along_energy(fact)}; reparametrise it."
         ]
     return []
 
@@ -85,14 +90,22 @@ def _e_bfmi(fact: EndedNuts) -> np.ndarray:
     return np.asarray(np.square(np.diff(energy, axis=1)).mean(axis=1) / energy.var(axis=1))
 
 
-def _neck(fact: EndedNuts) -> str:
-    """The element whose values differ most where draws diverge, or go along with the energy."""
-    x = fact.positions
-    standard = (x - x.mean(axis=0)) / np.maximum(x.std(axis=0), np.finfo(float).tiny)
-    diverging = fact.diverging.ravel()
-    if diverging.any():
-        means = standard[diverging].mean(axis=0)
-        i = int(np.abs(means).argmax())
-        return f"{fact.names[i]} is {'large' if means[i] > 0 else 'small'}"
+def where_diverging(names: Sequence[str], x: np.ndarray, diverging: np.ndarray) -> str:
+    """The element of draws (n, k) that differs most where they diverge, if not by chance."""
+    means = _standard(x)[diverging].mean(axis=0)
+    i = int(np.abs(means).argmax())
+    if np.abs(means[i]) * np.sqrt(diverging.sum()) < -ndtri(_BY_CHANCE / 2 / len(names)):
+        return ""
+    return f"{names[i]} is {'large' if means[i] > 0 else 'small'}"
+
+
+def _along_energy(fact: EndedNuts) -> str:
+    """The element whose values go along with the energy most."""
     energy = fact.energy.ravel()
-    return fact.names[int(np.abs(standard.T @ (energy - energy.mean())).argmax())]
+    along = _standard(fact.positions).T @ (energy - energy.mean())
+    return fact.names[int(np.abs(along).argmax())]
+
+
+def _standard(x: np.ndarray) -> np.ndarray:
+    """Draws in units of their standard deviations."""
+    return np.asarray((x - x.mean(axis=0)) / np.maximum(x.std(axis=0), np.finfo(float).tiny))

@@ -7,6 +7,7 @@ import numpy as np
 import pymc as pm
 
 import pymc_statespace_filters as psf
+from pymc_statespace_filters.advice.ended_nuts import where_diverging
 from pymc_statespace_filters.advice.mixing import mixing_problem, until_ess_problem
 from pymc_statespace_filters.advice.remedies import (
     alternatives,
@@ -113,3 +114,14 @@ def test_the_advice_works():
         )  # fmt: skip
         least.append(az.summary(idata)["ess_tail"].min())
     assert least[1] > 5 * least[0]
+
+
+def test_where_draws_diverge_is_said_of_no_variable_by_chance():
+    """In a hundred sets of draws of 200 variables, 72 of which diverge anywhere, about five."""
+    rng, names = np.random.default_rng(3), [f"x[{i}]" for i in range(200)]
+    diverging = np.arange(1000) % 14 == 0
+    named = [where_diverging(names, rng.normal(size=(1000, 200)), diverging) for _ in range(100)]
+    assert sum(map(bool, named)) <= 10
+    x = rng.normal(size=(1000, 200))
+    assert where_diverging(names, x, x[:, 7] < -1.5) == "x[7] is small"
+    assert where_diverging(names, x, x[:, 8] > 2.0) == "x[8] is large"
