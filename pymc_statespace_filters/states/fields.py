@@ -31,6 +31,7 @@ from .field_values import (
 
 _N_POINTS = {1: 101, 2: 41, 3: 21}  # of the grid along each state
 _N_JUDGED = 200  # visited states at which the field is compared with its prior
+_MOST_OUTSIDE = 0.02  # of the visited states outside of the box
 _SHORT = 0.1  # of the draws, with lengths that the terms cannot follow
 _LEAST_TOLD = 0.9  # of the prior sd, above which the record has said next to nothing
 _NAMES = {"mean", "sd", "low", "high", "prob_positive", "prior_sd", "near", "visited", "visit",
@@ -108,9 +109,9 @@ def field(
     Warns
     -----
     ModelWarning
-        If states leave the boundary of the basis; if the length of its kernel is shorter than its
-        terms can follow; if the field is about as uncertain as before the record; or if no system
-        has the states of the terms, so that there are no visited ones.
+        If states leave the boundary of the basis, or many its box; if the length of its kernel is
+        shorter than its terms can follow; if the field is about as uncertain as before the record;
+        or if no system has the states of the terms, so that there are no visited ones.
 
     See Also
     --------
@@ -286,11 +287,20 @@ def _doubts(
     if isinstance(basis, GaussianProcessTerms):
         low, high = basis.boundary.T
         beyond = ((paths < low) | (paths > high)).any(axis=(1, 2)).mean()
+        low, high = np.transpose(basis.box)
+        outside = ((paths < low) | (paths > high)).any(axis=2).mean()
         if beyond:
             yield (
                 f"in {beyond:.0%} of the draws states leave the boundary of the terms, "
                 f"{basis.boundary.round(3).tolist()}, beyond which the field is its mirror image "
                 "with the sign reversed: take a wider box, with as many more sines"
+            )
+        elif outside > _MOST_OUTSIDE:
+            yield (
+                f"{outside:.0%} of the visited states lie outside of the box, "
+                f"{[list(ends) for ends in basis.box]}, where the terms fall to zero, so that the "
+                "field is too small there and its band too narrow: take a wider box, with as many "
+                "more sines"
             )
     now, before = (
         np.linalg.norm(standard_deviation(each, basis, judged)) for each in (draws, prior)

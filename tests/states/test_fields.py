@@ -177,6 +177,12 @@ def test_what_the_result_does_not_mean_is_said(model):
     )
     with pytest.warns(ModelWarning, match=expected):
         psf.field(exact, model, terms={"c": small}, n_draws=1)
+    outside = abs(RECORD) > 1.2
+    assert 0.05 < outside.mean() < 1
+    within = psf.mechanics.gaussian_process_terms("z", (-1.2, 1.2), 6)
+    expected = rf"c: {outside.mean():.0%} of the visited states .* of the box, \[\[-1\.2, 1\.2\]\]"
+    with pytest.warns(ModelWarning, match=expected):
+        psf.field(exact, model, terms={"c": within}, n_draws=1)
     other = psf.mechanics.gaussian_process_terms("x", (-2, 2), 6)
     with pytest.warns(ModelWarning, match=r"no system has states of the names \['x'\]"):
         found = psf.field(exact, model, terms={"c": other}, n_draws=1)
