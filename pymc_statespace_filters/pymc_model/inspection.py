@@ -32,7 +32,9 @@ def given_model(model: pm.Model | None) -> pm.Model:
         raise ModelError(f"model must be a pymc.Model, got {type(model).__name__}{advice}")
     found = pm.Model.get_context(error_if_none=False) if model is None else model
     if found is None:
-        raise ModelError("model must be given outside a `with` block of a model, got None")
+        raise ModelError(
+            "model must be given outside a `with` block of a model, as model=m, got None"
+        )
     return found
 
 

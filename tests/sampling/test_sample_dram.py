@@ -219,7 +219,7 @@ def test_models_that_cannot_be_sampled():
         pm.Normal("y", mu, 1, observed=pm.Minibatch(np.arange(9.0), batch_size=3), total_size=9)
     with pytest.raises(ModelError, match=r"'y' draws random numbers from a generator"):
         sample_dram(drawing)
-    with pytest.raises(ModelError, match="model must be given outside a `with` block"):
+    with pytest.raises(ModelError, match=r"outside a `with` block of a model, as model=m"):
         psf.sample_dram()
 
 
