@@ -24,8 +24,10 @@ import pymc as pm
 import pytensor.tensor as pt
 from pymc.logprob.transforms import LogTransform
 from pytensor.graph.basic import Apply, Constant, Variable
+from pytensor.graph.rewriting.utils import rewrite_graph
 from pytensor.graph.traversal import applys_between
 from pytensor.scalar.basic import Add, Exp, Identity, Mul, Neg, Pow, Sub, TrueDiv
+from pytensor.scalar.math import Sigmoid
 from pytensor.tensor.elemwise import DimShuffle, Elemwise
 from pytensor.tensor.shape import Shape, Shape_i
 from pytensor.tensor.subtensor import AdvancedSubtensor, Subtensor
@@ -270,19 +272,31 @@ def _has_sign(variable: Variable) -> bool:
 
 
 def _is_positive(variable: Variable) -> bool:
-    """Whether a variable is positive by the way in which it is made."""
+    """Whether a variable is positive by the way in which it is made.
+
+    Simplified, as the transform of an interval chooses by its ends, and adds them where they are
+    zero.
+    """
+    return _made_positive(rewrite_graph(variable, include=("canonicalize", "stabilize")))
+
+
+def _made_positive(variable: Variable) -> bool:
     if isinstance(variable, Constant):
         return bool(np.all(variable.data > 0.0))
     node = variable.owner
     if node is None:
         return False
     if isinstance(node.op, DimShuffle | Subtensor | AdvancedSubtensor):
-        return _is_positive(node.inputs[0])
+        return _made_positive(node.inputs[0])
     match node.op.scalar_op if isinstance(node.op, Elemwise) else None:
-        case Exp():
+        case Exp() | Sigmoid():
             return True
+        case Sub():
+            one, share = (getattr(v.owner, "op", v) for v in node.inputs)
+            is_one = isinstance(one, Constant) and np.all(one.data == 1.0)
+            return bool(is_one) and isinstance(getattr(share, "scalar_op", None), Sigmoid)
         case Pow():
-            return _is_positive(node.inputs[0])
+            return _made_positive(node.inputs[0])
         case Add() | Mul() | TrueDiv() | Identity():
-            return all(map(_is_positive, node.inputs))
+            return all(map(_made_positive, node.inputs))
     return False

@@ -60,6 +60,19 @@ def factors():
     panel(rate=0.3, level=level)
 
 
+def uniform_widths():
+    """Intervals that begin at zero or above."""
+    typical, omega = pm.Uniform("typical", 0.1, 5), pm.Uniform("omega", 0, 2)
+    upper = pm.TruncatedNormal("upper", 0, 1, lower=0)
+    effect = typical * omega / upper * pm.Normal("z", dims="machine")
+    panel(rate=0.3, level=effect)
+
+
+def width_of_any_sign():
+    width = pm.Uniform("width", -1, 2)
+    panel(rate=0.3, level=0.5 + width * pm.Normal("z", dims="machine"))
+
+
 def around_zero():
     """The effects have the variance of the population, and not its mean."""
     typical, omega = pm.LogNormal("typical"), pm.HalfNormal("omega")
@@ -201,6 +214,8 @@ FORMS = {  # own, population, shared
     centred: (["x"], ["mu", "sd"], ["level"]),
     non_centred: (["z"], ["mu", "sd"], []),
     factors: (["z"], ["typical", "omega"], []),
+    uniform_widths: (["z"], ["typical", "omega", "upper"], []),
+    width_of_any_sign: (["z"], [], ["width"]),
     around_zero: (["z"], ["typical", "omega"], []),
     columns: (["z"], ["mu", "sd"], []),
     column_from_both_ends: (["z"], [], ["mu", "sd"]),
