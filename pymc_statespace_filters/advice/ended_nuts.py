@@ -18,8 +18,9 @@ from .words import log, told
 # Bayesian fraction of missing information of the energies, below which the tails of one are too
 # long for its momenta (Betancourt 2016).
 _LEAST_E_BFMI = 0.3
-# Probability with which a variable is named for divergences that have nothing to do with any.
-_BY_CHANCE = 0.05
+# A variable is named for divergences that have nothing to do with any with this probability, and
+# never if its mean where draws diverge differs by less, in standard deviations.
+_BY_CHANCE, _LEAST_SHIFT = 0.05, 0.5
 
 
 @told.register
@@ -94,7 +95,8 @@ def where_diverging(names: Sequence[str], x: np.ndarray, diverging: np.ndarray) 
     """The element of draws (n, k) that differs most where they diverge, if not by chance."""
     means = _standard(x)[diverging].mean(axis=0)
     i = int(np.abs(means).argmax())
-    if np.abs(means[i]) * np.sqrt(diverging.sum()) < -ndtri(_BY_CHANCE / 2 / len(names)):
+    by_chance = -ndtri(_BY_CHANCE / 2 / len(names)) / np.sqrt(diverging.sum())
+    if np.abs(means[i]) < max(by_chance, _LEAST_SHIFT):
         return ""
     return f"{names[i]} is {'large' if means[i] > 0 else 'small'}"
 
