@@ -9,9 +9,11 @@ from these draws, and `field` the force.
 
 ``python -m benchmarks.missing_force 60`` prints, of 60 records: the errors of the log Bayes factors
 over their standard errors, mean (0) and root mean square (1), and the largest error; z of
-sum(truth - probability); of the records in which nothing is missing, how many factors are above 3
-and 10, at most a third and a tenth; and of the others the share of the visited states at which the
-90 % band has the force. A record takes about 4 CPU s. A second number is the first seed.
+sum(truth - probability); of probabilities in five bins the mean, the frequency of a force and the
+number, with the p value of all bins; of the records in which nothing is missing, how many factors
+are above 3 and 10, at most a third and a tenth; and of the others the share of the visited states
+at which the 90 % band has the force. A record takes about 4 CPU s. A second number is the first
+seed.
 """
 
 import sys
@@ -22,10 +24,12 @@ import arviz as az
 import numpy as np
 import pymc as pm
 from scipy.special import expit, logsumexp
+from scipy.stats import chi2
 
 import pymc_statespace_filters as psf
 
 N_ROWS, DT, NOISE = 300, 0.1, 0.5
+N_BINS = 5  # of probabilities
 LENGTH, WIDTH = 1.0, 1.0  # of the kernel, and of the prior of the amplitude
 BASIS = psf.mechanics.gaussian_process_terms("z", (-2.5, 2.5), 10)
 SD = BASIS.prior_sd(LENGTH, 1.0).eval()
@@ -132,21 +136,36 @@ def main(count: int, first: int = 1) -> None:
     error = np.array([one.reported - one.exact for one in found])
     scaled = error / [one.se for one in found]
     doubtful = np.array([one.doubtful for one in found])
-    missing = np.array([one.missing for one in found])
-    probability = expit([one.reported for one in found])
-    z = (missing - probability).sum() / np.sqrt((probability * (1 - probability)).sum())
     sure = ~doubtful
     print(
         f"error / se: mean {scaled[sure].mean():.2f}, rms {np.sqrt((scaled[sure] ** 2).mean()):.2f}"
     )
     print(f"largest error {abs(error[sure]).max():.2f} nats; {doubtful.sum()} of {count} doubtful")
+    print_calibration(found)
+
+
+def print_calibration(found) -> None:
+    """Print whether probabilities of a missing force, and bands of it, are calibrated."""
+    missing, reported, covered = (
+        np.array([getattr(one, name) for one in found])
+        for name in ("missing", "reported", "covered")
+    )
+    probability = expit(reported)
+    variance = probability * (1 - probability)
+    z = (missing - probability).sum() / np.sqrt(variance.sum())
     print(f"z of sum(truth - probability): {z:.1f}")
-    factors = np.exp([one.reported for one in found])[~missing]
+    chi_square, bins = 0.0, np.minimum((N_BINS * probability).astype(int), N_BINS - 1)
+    for one in np.unique(bins):
+        within = bins == one
+        mean, frequency = probability[within].mean(), missing[within].mean()
+        print(f"  probability {mean:.2f}, frequency {frequency:.2f} of {within.sum()}")
+        chi_square += (missing - probability)[within].sum() ** 2 / variance[within].sum()
+    print(f"p of these frequencies: {chi2.sf(chi_square, len(np.unique(bins))):.2f}")
     for k in (3, 10):
-        print(f"nothing missing: {(factors > k).sum()} of {len(factors)} factors above {k}")
-    powerful = (np.array([one.reported for one in found])[missing] > np.log(3)).sum()
-    print(f"a force: {powerful} of {missing.sum()} factors above 3")
-    covered = np.array([one.covered for one in found])[missing]
+        above = reported > np.log(k)
+        print(f"nothing missing: {above[~missing].sum()} of {(~missing).sum()} factors above {k}")
+    print(f"a force: {(reported[missing] > np.log(3)).sum()} of {missing.sum()} factors above 3")
+    covered = covered[missing]
     se = covered.std() / np.sqrt(len(covered))
     print(f"90 % bands at visited states: {covered.mean():.3f} ({se:.3f})")
 
