@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pymc as pm
+import pytensor.tensor as pt
 import xarray as xr
 from numpy.typing import NDArray
 
@@ -29,7 +30,7 @@ from .budget import Budget
 from .estimates import Comparison, compare, is_unbiased, witnesses
 from .finding import EXACT, FINE, OFF, UNDECIDED, Finding
 from .low import low_at
-from .points import points_elsewhere
+from .points import SPREADS, points_elsewhere
 
 Array = NDArray[np.float64]
 
@@ -174,7 +175,7 @@ def _check_variable(
     if not budget.is_spent:
         points, factors = points_elsewhere(model, draws, n_elsewhere, rng)
         others = evaluate(variable.moved_to(points), filters)
-        others = others.at(_is_relevant(model, name, (x, found), (points, others), factors))
+        others = others.at(_is_relevant(model, name, draws, (x, found), (points, others), factors))
         if len(others.checked.logs):
             is_low = bias_elsewhere(others, found) if scored else [low_at(others, "elsewhere")]
     while n_draws < len(x) and not (is_settled(findings) or budget.is_spent):
@@ -187,21 +188,44 @@ def _check_variable(
 def _is_relevant(
     model: pm.Model,
     name: str,
-    draws: tuple[Array, Comparison],
+    draws: Array,
+    at_draws: tuple[Array, Comparison],
     others: tuple[Array, Comparison],
     factors: Array,
 ) -> NDArray[np.bool_]:
     """Which other points the posterior would hold, by the highest of all estimates there.
 
-    Of points that were compared, the first: the others have no estimates.
+    By the weight of each in importance sampling: moved away, from the posterior that is as many
+    times wider; of the prior, by its likelihood over the evidence, too. Of points that were
+    compared, the first: the others have no estimates.
     """
-    terms = [term.sum() for variable, term in log_density_terms(model) if variable != name]
-    highest = [found.highest for _, found in (draws, others)]
+    free = {rv.name for rv in model.free_RVs}
+    terms = log_density_terms(model)
+    prior = pt.sum([term.sum() for variable, term in terms if variable in free])
+    data = [term.sum() for variable, term in terms if variable not in {name, *free}]
+    highest = [found.highest for _, found in (at_draws, others)]
     n, m = map(len, highest)
-    x = np.concatenate([draws[0][:n], others[0][:m]])
-    density = np.concatenate(highest) + np.sum(GraphsAtPoints(model, terms)(x), axis=0)
-    lowest = density[:n][np.isfinite(density[:n])].min(initial=np.inf)
-    return density[n:] >= lowest - _SLACK - x.shape[1] * np.log(factors[:m])
+    x = np.concatenate([at_draws[0][:n], others[0][:m]])
+    log_prior, *of_data = GraphsAtPoints(model, [prior, *data])(x)
+    likelihood = np.concatenate(highest) + np.sum(of_data, axis=0)
+    density = likelihood + log_prior
+    known = density[:n][np.isfinite(density[:n])]
+    times_wider = x.shape[1] * np.log(np.minimum(factors[:m], max(SPREADS)))
+    weight = density[n:] - known.min(initial=np.inf) + times_wider
+    of_prior = np.isinf(factors[:m])
+    if known.size and of_prior.any():
+        log_evidence = known.mean() + _normal_entropy(draws)
+        weight[of_prior] = np.minimum(weight, likelihood[n:] - log_evidence)[of_prior]
+    return weight >= -_SLACK
+
+
+def _normal_entropy(draws: Array) -> float:
+    """The entropy of a normal distribution with the covariance of draws (n, k); -inf without one.
+
+    A posterior has at most as much, so that the evidence is not larger than with it.
+    """
+    _, log_det = np.linalg.slogdet(np.atleast_2d(np.cov(draws, rowvar=False)))
+    return float(0.5 * (draws.shape[1] * np.log(2 * np.pi * np.e) + log_det))
 
 
 def outcomes_of(table: pd.DataFrame) -> dict[str, dict[str, str]]:

@@ -12,7 +12,7 @@ from ...pymc_model.prior import ModelPrior
 
 Array = NDArray[np.float64]
 
-_SPREADS = (2.0, 3.0)  # of the points around the posterior, in its own spread
+SPREADS = (2.0, 3.0)  # of the points around the posterior, in its own spread
 _PRIOR_SHARE = 0.2  # of the points elsewhere
 
 
@@ -21,15 +21,15 @@ def points_elsewhere(
 ) -> tuple[Array, Array]:
     """Points (n, k) of the unconstrained space around draws or in the prior, in mixed order.
 
-    With each the factor by which it was moved away from the mean of the draws, of the prior the
-    largest.
+    With each the factor by which it was moved away from the mean of the draws, of the prior
+    infinity.
     """
     prior = _prior_draws(model, round(_PRIOR_SHARE * n), rng)
     prior = prior if len(prior) else draws[:0]
-    factors, mean = np.resize(_SPREADS, n - len(prior)), draws.mean(axis=0)
+    factors, mean = np.resize(SPREADS, n - len(prior)), draws.mean(axis=0)
     moved = mean + factors[:, None] * (draws[rng.integers(len(draws), size=len(factors))] - mean)
     order = rng.permutation(n)
-    factors = np.concatenate([factors, np.full(len(prior), max(_SPREADS))])
+    factors = np.concatenate([factors, np.full(len(prior), np.inf)])
     return np.concatenate([moved, prior])[order], factors[order]
 
 

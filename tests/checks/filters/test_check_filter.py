@@ -2,15 +2,18 @@
 
 import json
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import ClassVar
 
 import arviz as az
 import numpy as np
 import pymc as pm
 import pytest
+from scipy.stats import norm
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.checks.filters import checks, estimates
+from pymc_statespace_filters.checks.filters.checks import _is_relevant
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.pymc_model.filter_estimates import VariableAtPoints
 from tests.systems import FREE, autoregression
@@ -27,6 +30,15 @@ SQUARE_AND_LINE = psf.StateSpaceModel(
     observation_noise=np.diag([0.04, 0.3]),
     initial_mean=[0.0, 0.0],
     initial_cov=np.eye(2),
+)
+
+LEVEL = psf.StateSpaceModel(
+    transition=lambda x, q, level: [level + q[0]],
+    process_noise=[[0.01]],
+    observation=lambda x: [x[0]],
+    observation_noise=[[0.01]],
+    initial_mean=[0.0],
+    initial_cov=[[1.0]],
 )
 
 
@@ -234,3 +246,38 @@ def test_a_model_without_such_a_variable_is_refused():
         pm.Normal("phi")
     with pytest.raises(ModelError, match="observed StateSpace variable"):
         psf.check_filter(draws_of(), model)
+
+
+def test_which_other_points_the_posterior_would_hold():
+    """In sixty dimensions most draws of the prior are far too unlikely, and none is by its volume.
+
+    The evidence is known: the level is the sum of the variables, over the root of their number.
+    """
+    with pm.Model() as model:
+        theta = pm.Normal("theta", shape=60)
+        level = theta.sum() / np.sqrt(60)
+        psf.StateSpace("d", LEVEL, psf.EKF(), steps=[1], observed=[2.0], params={"level": level})
+    rng, variance = np.random.default_rng(1), 0.02  # of the data
+
+    def posterior(theta):
+        """Draws of the prior, of which the level alone is as given the data."""
+        gain = 1 / (1 + variance)
+        new = 2.0 * gain + np.sqrt(variance * gain) * rng.normal(size=len(theta))
+        return theta + (new - theta.sum(axis=1) / np.sqrt(60))[:, None] / np.sqrt(60)
+
+    draws, prior = posterior(rng.normal(size=(2000, 60))), rng.normal(size=(200, 60))
+
+    def exact(theta):
+        log_likelihood = norm.logpdf(2.0, theta.sum(axis=1) / np.sqrt(60), np.sqrt(variance))
+        return theta, SimpleNamespace(highest=log_likelihood)
+
+    evidence = norm.logpdf(2.0, 0, np.sqrt(1 + variance))
+    far = 30.0 * np.ones((1, 60))  # beyond the draws and without likelihood
+    points = np.concatenate([prior, draws.mean(axis=0) + 2 * (draws[:5] - draws.mean(axis=0)), far])
+    factors = np.repeat([np.inf, 2.0, 3.0], [200, 5, 1])
+    found = _is_relevant(model, "d", draws, exact(draws[:40]), exact(points), factors)
+    weight = exact(prior)[1].highest - evidence
+    clear = abs(weight + 3.0) > 1.5  # of the estimate of the evidence
+    assert 0 < (weight[clear] > -3.0).sum() < 100
+    np.testing.assert_array_equal(found[:200][clear], weight[clear] > -3.0)
+    assert not found[-1]
