@@ -32,6 +32,7 @@ from .field_values import (
 _N_POINTS = {1: 101, 2: 41, 3: 21}  # of the grid along each state
 _N_JUDGED = 200  # visited states at which the field is compared with its prior
 _MOST_OUTSIDE = 0.02  # of the visited states outside of the box
+_MOST_TERMS = 200  # that are advised, about as many as have been tried
 _SHORT = 0.1  # of the draws, with lengths that the terms cannot follow
 _LEAST_TOLD = 0.9  # of the prior sd, above which the record has said next to nothing
 _NAMES = {"mean", "sd", "low", "high", "prob_positive", "prior_sd", "near", "visited", "visit",
@@ -222,9 +223,12 @@ def _checked_axes(at: Any, terms: Mapping[str, Terms]) -> dict[str, Array]:
             f"at must give values of the states {sorted(states)}, as "
             f"{{{min(states)!r}: np.linspace(-1, 1, 50)}}, got {at!r}"
         )
-    axes = {state: check_floats(f"at[{state!r}]", values, 1) for state, values in given.items()}
+    axes = {
+        state: np.atleast_1d(check_floats(f"at[{state!r}]", values, None))
+        for state, values in given.items()
+    }
     for state, axis in axes.items():
-        if not axis.size or (np.diff(axis) <= 0).any():
+        if axis.ndim > 1 or not axis.size or (np.diff(axis) <= 0).any():
             raise ModelError(f"at[{state!r}] must have values that rise, got {given[state]!r}")
     return axes
 
@@ -293,14 +297,13 @@ def _doubts(
             yield (
                 f"in {beyond:.0%} of the draws states leave the boundary of the terms, "
                 f"{basis.boundary.round(3).tolist()}, beyond which the field is its mirror image "
-                "with the sign reversed: take a wider box, with as many more sines"
+                f"with the sign reversed: take {_wider(basis, paths)}"
             )
         elif outside > _MOST_OUTSIDE:
             yield (
                 f"{outside:.0%} of the visited states lie outside of the box, "
                 f"{[list(ends) for ends in basis.box]}, where the terms fall to zero, so that the "
-                "field is too small there and its band too narrow: take a wider box, with as many "
-                "more sines"
+                f"field is too small there and its band too narrow: take {_wider(basis, paths)}"
             )
     now, before = (
         np.linalg.norm(standard_deviation(each, basis, judged)) for each in (draws, prior)
@@ -315,6 +318,22 @@ def _doubts(
         )
 
 
+def _wider(basis: GaussianProcessTerms, paths: Array) -> str:
+    """A box with all visited states (draws, rows, states), and sines as short as those of now.
+
+    Without numbers where states are so far away that the sines would be too many.
+    """
+    low, high = np.transpose(basis.box)
+    unit = 10 ** np.floor(np.log10(high - low) - 1)
+    wide_low = np.minimum(low, np.floor(np.nanmin(paths, axis=(0, 1)) / unit) * unit)
+    wide_high = np.maximum(high, np.ceil(np.nanmax(paths, axis=(0, 1)) / unit) * unit)
+    n = np.ceil(basis.n * (wide_high - wide_low) / (high - low) - 1e-9)
+    if not n.prod() <= _MOST_TERMS:
+        return "a wider box, with as many more sines"
+    box = [[float(f"{end:.6g}") for end in ends] for ends in zip(wide_low, wide_high, strict=True)]
+    return f"the box {box}, with n={n.astype(int).tolist()} sines"
+
+
 def _doubts_of_lengths(basis: Terms, lengths: Array | None) -> Iterator[str]:
     """Whether the draws have lengths of the kernel (draws, states) that the terms cannot follow."""
     if lengths is None or not isinstance(basis, GaussianProcessTerms):
@@ -323,9 +342,10 @@ def _doubts_of_lengths(basis: Terms, lengths: Array | None) -> Iterator[str]:
     share = (lengths < shortest).any(axis=1).mean()
     if share > _SHORT:
         needed = np.ceil(basis.n * np.maximum(shortest / np.quantile(lengths, 0.05, axis=0), 1))
+        more = f"n={needed.astype(int).tolist()}, or " if needed.prod() <= _MOST_TERMS else ""
         yield (
             f"in {share:.0%} of the draws the length of the kernel is below "
             f"{shortest.round(3).tolist()}, the shortest that {list(basis.n)} sines can follow, so "
-            f"that the field is smoother than these lengths say: take "
-            f"n={needed.astype(int).tolist()}, or a prior of the length that begins there"
+            f"that the field is smoother than these lengths say: take {more}a prior of the length "
+            "that begins there"
         )

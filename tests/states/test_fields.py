@@ -1,5 +1,7 @@
 """Fields at draws of their coefficients, against the closed form of a Bayesian regression."""
 
+import json
+import re
 from contextlib import nullcontext
 
 import arviz as az
@@ -41,6 +43,9 @@ def of_one_state(basis=BASIS, states=("z",), noise=NOISE, length=LENGTH):
     with pm.Model() as model:
         if length is None:
             length = pm.HalfNormal("length", 2.0)
+        elif length == "of_each_state":
+            model.add_coord("state", states)
+            length = pm.HalfNormal("length", 2.0, dims="state")
         pm.Normal("c", 0, basis.prior_sd(length, AMPLITUDE), shape=len(basis))
         psf.StateSpace("d", system, psf.EKF(), steps=np.arange(len(RECORD)), observed=RECORD)
     return model
@@ -156,6 +161,8 @@ def test_fields_of_two_states_have_them_as_axes():
     of_library = found["b"]
     v = of_library["v"].values
     np.testing.assert_allclose(v[[0, -1]], [RECORD_3[:, 1].min(), RECORD_3[:, 1].max()], atol=1e-5)
+    at_one = psf.field(idata, model, terms={"c": PAIR}, at={"w": -0.5}, n_draws=1)["c"]
+    np.testing.assert_allclose(at_one["mean"], found["c"]["mean"].sel(w=[-0.5]))
     exact = np.outer(at["w"], v) - 2 * v**2
     np.testing.assert_allclose(of_library["mean"], exact, atol=1e-12)
     assert of_library["prior_sd"].isnull().all()
@@ -183,6 +190,9 @@ def test_what_the_result_does_not_mean_is_said(model):
     expected = rf"c: {outside.mean():.0%} of the visited states .* of the box, \[\[-1\.2, 1\.2\]\]"
     with pytest.warns(ModelWarning, match=expected):
         psf.field(exact, model, terms={"c": within}, n_draws=1)
+    huge = psf.mechanics.gaussian_process_terms("z", (-0.01, 0.01), 6)
+    with pytest.warns(ModelWarning, match="reversed: take a wider box, with as many more sines"):
+        psf.field(exact, model, terms={"c": huge}, n_draws=1)
     other = psf.mechanics.gaussian_process_terms("x", (-2, 2), 6)
     with pytest.warns(ModelWarning, match=r"no system has states of the names \['x'\]"):
         found = psf.field(exact, model, terms={"c": other}, n_draws=1)
@@ -190,19 +200,48 @@ def test_what_the_result_does_not_mean_is_said(model):
     assert found["c"]["visited"].shape == (0, 1)
 
 
+@pytest.mark.parametrize(("low", "high"), [(-0.8, 0.8), (-1.2, 1.2), (-3.0, 0.5)])
+def test_the_box_that_is_advised_holds_the_states(model, low, high):
+    """With sines as short as those of the smaller box."""
+    small = psf.mechanics.gaussian_process_terms("z", (low, high), 6)
+    with pytest.warns(ModelWarning) as warned:
+        psf.field(draws_of(*regression(RECORD)), model, terms={"c": small}, n_draws=1)
+    said = re.search(r"take the box (.*), with n=(.*) sines$", str(warned[0].message))
+    box, n = map(json.loads, said.groups())
+    wide = psf.mechanics.gaussian_process_terms("z", box, n)
+    assert low >= box[0][0] > RECORD.min() - 0.2 or box[0][0] == low
+    assert high <= box[0][1] < RECORD.max() + 0.2
+    assert 0.85 * small.shortest_length < wide.shortest_length <= small.shortest_length
+    draws = draws_of(np.zeros(len(wide)), np.diag(0.01 * wide.prior_sd(LENGTH, 1.0).eval() ** 2))
+    found = psf.field(draws, of_one_state(wide), terms={"c": wide}, n_draws=1)
+    assert found["c"].attrs["doubts"] == ""
+
+
+@pytest.mark.parametrize("shape", [None, "of_each_state"])
 @pytest.mark.parametrize(("length", "said"), [(0.5, True), (0.8, False)])
-def test_lengths_that_the_terms_cannot_follow_are_said(length, said):
+def test_lengths_that_the_terms_cannot_follow_are_said(length, said, shape):
     """A fifth of the draws has this length; the shortest of six sines is 0.75."""
     idata = draws_of(*regression(RECORD))
     idata["posterior"]["length"] = xr.full_like(
         idata["posterior"]["c"].isel(c_dim_0=0, drop=True), 2.0
     )
     idata["posterior"]["length"][:, ::5] = length
+    if shape:
+        idata["posterior"]["length"] = idata["posterior"]["length"].expand_dims(state=["z"], axis=2)
     expected = (
         r"c: in 20% of the draws the length of the kernel is below \[0\.749\], the shortest that "
         r"\[6\] sines can follow, so .*: take n=\[9\], or a prior"
     )
     with pytest.warns(ModelWarning, match=expected) if said else nullcontext():
+        psf.field(idata, of_one_state(length=shape), terms={"c": BASIS}, n_draws=1)
+
+
+def test_a_prior_is_advised_where_sines_would_be_too_many():
+    """The shortest lengths of a prior that begins at zero ask for hundreds of them."""
+    idata = draws_of(*regression(RECORD))
+    lengths = np.linspace(1e-3, 2.0, N_DRAWS).reshape(4, -1)
+    idata["posterior"]["length"] = xr.DataArray(lengths**3, dims=("chain", "draw"))
+    with pytest.warns(ModelWarning, match="say: take a prior of the length that begins there"):
         psf.field(idata, of_one_state(length=None), terms={"c": BASIS}, n_draws=1)
 
 

@@ -80,10 +80,11 @@ def test_one_length_is_that_of_all_states_and_both_may_be_variables():
     length, amplitude = pt.dscalar(), pt.dscalar()
     symbolic = basis.prior_sd(length, amplitude).eval({length: 0.5, amplitude: 2.0})
     np.testing.assert_allclose(symbolic, basis.prior_sd([0.5, 0.5], 2.0).eval())
-    with pm.Model(coords={"term": basis.names}) as model:
-        scale, length = pm.HalfNormal("scale", 1), pm.HalfNormal("length", 1, shape=2)
-        pm.Normal("c", 0, basis.prior_sd(length, scale), dims="term")
-    assert np.isfinite(model.compile_logp()(model.initial_point()))
+    for form in ({"shape": 2}, {"dims": "state"}):
+        with pm.Model(coords={"term": basis.names, "state": basis.states}) as model:
+            scale, length = pm.HalfNormal("scale", 1), pm.HalfNormal("length", 1, **form)
+            pm.Normal("c", 0, basis.prior_sd(length, scale), dims="term")
+        assert np.isfinite(model.compile_logp()(model.initial_point()))
 
 
 def test_the_sines_hold_nine_tenths_of_the_variance_at_the_shortest_length():
