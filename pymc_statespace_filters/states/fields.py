@@ -126,7 +126,7 @@ def field(
     >>> import numpy as np
     >>> import pymc as pm
     >>> import pymc_statespace_filters as psf
-    >>> basis = psf.mechanics.gaussian_process_terms("z", (0, 2), 4)
+    >>> basis = psf.mechanics.gaussian_process_terms("z", (-0.5, 2.5), 6)
     >>> system = psf.StateSpaceModel(
     ...     states=["z"],
     ...     transition=lambda x, q, c: [x[0] + 0.1 * (c @ basis(x)) + 0.05 * q[0]],

@@ -1,5 +1,6 @@
 """Chains of nutpie, looked at while they run, until their draws are worth enough."""
 
+import math
 import time
 import warnings
 from collections.abc import Callable
@@ -169,8 +170,8 @@ def _followed(
     kept = _kept(trace, length, found, seconds)
     kept = kept._replace(is_stuck=is_stuck, is_beaten=is_beaten)
     made = kept.positions.shape[1]
-    if is_beaten:  # how many draws there are depends on when it was seen
-        return kept._replace(found=None)
+    if is_beaten:  # how many draws there are depends on when it was seen, and what they took
+        return kept._replace(found=None, n_gradients=math.floor(most_gradients) + 1)
     if made == length.draws:
         return kept
     found = convergence(list(kept.positions))
