@@ -5,7 +5,8 @@ non-centred form as a + b v alone, or as exp(a + b v), where a and b are made of
 share. In the centred coordinates c = a + b v no likelihood depends on a and b, unless by another
 way. A chain can then move the parameters of the population without a likelihood, and each record by
 itself, at a scale that its own data give. The change of coordinates is exact: with v = (c - a) / b
-the log-density is that of the model, and the log-Jacobian -log|b| for each entry.
+the log-density is that of the model, and the log-Jacobian -log|b| for each entry. In the centred
+form c is a variable of the model, and its prior names a and b.
 
 References
 ----------
@@ -153,10 +154,9 @@ def centring_of(
 def centred_by_prior(
     value: TensorVariable, model: pm.Model, point: Mapping[str, Any]
 ) -> Centring | None:
-    """The coordinates that a value has in the model, if its prior has a location and a scale.
+    """The coordinates c that a value has in the model, if its prior has a location and a scale.
 
-    v is then a standard variable, on which no parameter of the population depends. A centred value
-    of `centring_of` is none of the model, and its v has a prior without parameters.
+    v = (c - a) / b is then a standard variable: its prior has no parameters of the population.
     """
     rv = model.values_to_rvs.get(value)
     place = _LOCATIONS.get(type(rv.owner.op)) if rv is not None else None
@@ -292,9 +292,10 @@ def _made_positive(variable: Variable) -> bool:
         case Exp() | Sigmoid():
             return True
         case Sub():
-            one, share = (getattr(v.owner, "op", v) for v in node.inputs)
-            is_one = isinstance(one, Constant) and np.all(one.data == 1.0)
-            return bool(is_one) and isinstance(getattr(share, "scalar_op", None), Sigmoid)
+            one, share = node.inputs
+            op = share.owner.op if share.owner is not None else None
+            is_share = isinstance(op, Elemwise) and isinstance(op.scalar_op, Sigmoid)
+            return is_share and isinstance(one, Constant) and bool(np.all(one.data == 1.0))
         case Pow():
             return _made_positive(node.inputs[0])
         case Add() | Mul() | TrueDiv() | Identity():

@@ -120,8 +120,6 @@ class GaussianProcessTerms:
         lengths = as_symbol("lengthscale", lengthscale)
         amplitude = as_symbol("amplitude", amplitude)
         self._check_prior(lengths, amplitude)
-        if lengths.type.shape == (None,):  # as of a variable with dims
-            lengths = pt.specify_shape(lengths, (d,))
         lengths = pt.broadcast_to(lengths, (d,)).copy(name=KERNEL_LENGTHS)
         frequencies = np.array(list(self._half_waves())) * self._slowest()
         squares = pt.sum((frequencies * lengths) ** 2, axis=1)
@@ -142,7 +140,7 @@ class GaussianProcessTerms:
         return np.pi / np.diff(self.boundary)[:, 0]
 
     def _check_prior(self, lengths: TensorVariable, amplitude: TensorVariable) -> None:
-        shapes = (), (len(self.states),), (None,)
+        shapes = (), (len(self.states),), (None,)  # the last of a variable with dims
         if static_shape(lengths) not in shapes:
             raise ModelError(
                 f"lengthscale must be a number or one for each of {list(self.states)}, got shape "

@@ -171,6 +171,8 @@ def test_nuts_ends_where_it_takes_more_than_it_may(most):
     sample_nuts(stiff(8), request, options, "", points, most)
     (nuts,) = runs
     assert nuts.is_beaten == (most < np.inf)
+    if nuts.is_beaten:  # whenever that was seen
+        assert nuts.n_gradients == most + 1
     assert (nuts.n_gradients > most) == nuts.is_beaten
     assert (nuts.convergence is None) == nuts.is_beaten  # so that no walk starts from its draws
 
