@@ -21,21 +21,11 @@ Key = str | tuple[str, ...]
 
 @dataclass(frozen=True)
 class Candidates:
-    """The K candidate terms of a model.
+    """The K candidate terms of a model."""
 
-    Attributes
-    ----------
-    elements : Elements
-        Of the model.
-    switches : Switches
-        Their columns of the unconstrained vector, and the values at which they vanish.
-    keys : tuple
-        Their names: a scalar, or a tuple of scalars.
-    """
-
-    elements: Elements
-    switches: Switches
-    keys: tuple[Key, ...]
+    elements: Elements  # of the model
+    switches: Switches  # their columns of the unconstrained vector, and where they vanish
+    keys: tuple[Key, ...]  # their names: a scalar, or a tuple of scalars
 
     def __len__(self) -> int:
         return len(self.keys)

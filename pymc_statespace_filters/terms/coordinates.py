@@ -25,23 +25,12 @@ POWERS = np.linspace(0.0, 1.0, 5)
 
 @dataclass(frozen=True)
 class Coordinates:
-    """The map between the unconstrained vector x and coordinates y, both (n, k).
-
-    Attributes
-    ----------
-    density : SubmodelDensity
-    power : ndarray (k,)
-        Zero for columns that stay as they are.
-    power_of_values : ndarray (k,)
-        The same for the variables as they are, which have no transform.
-    centre : ndarray (k,)
-        The values a.
-    """
+    """The map between the unconstrained vector x and coordinates y, both (n, k)."""
 
     density: SubmodelDensity
-    power: Array
-    power_of_values: Array
-    centre: Array
+    power: Array  # (k,), zero for columns that stay as they are
+    power_of_values: Array  # (k,), the same for the variables as they are, without a transform
+    centre: Array  # (k,), the values a
 
     def log_scale(self, x: Array) -> Array:
         """The log of dy / dx of every column, (n, k); it depends on columns that stay."""

@@ -36,16 +36,12 @@ Sets = NDArray[np.bool_]
 class InclusionPrior:
     """The prior of sets of K candidates.
 
-    Attributes
-    ----------
-    probability : ndarray (K,) or None
-        Of independent candidates, zero and one included; None for the beta-binomial prior.
-    needed : ndarray of bool (K, K)
-        Which others (columns) a candidate (row) requires.
+    ``probability`` (K,) is that of independent candidates, zero and one included; None for the
+    beta-binomial prior.
     """
 
     probability: Array | None
-    needed: Sets
+    needed: Sets  # (K, K), which others (columns) a candidate (row) requires
 
     def permits(self, present: Sets) -> NDArray[np.bool_]:
         """Whether sets (..., K) have what their members require."""

@@ -32,24 +32,12 @@ BULK = 3.0  # standard deviations of a squared distance
 
 @dataclass(frozen=True)
 class Maximum:
-    """A maximum of a sub-model's density in the coordinates that a proposal draws.
+    """A maximum of a sub-model's density in the coordinates that a proposal draws."""
 
-    Attributes
-    ----------
-    point : ndarray (k,)
-        With the other coordinates as they were at first.
-    drawn : ndarray of int (d,)
-        The columns of these coordinates.
-    precision : ndarray (d, d)
-        Minus the second derivatives.
-    log_evidence : float
-        By Laplace's approximation.
-    """
-
-    point: Array
-    drawn: Columns
-    precision: Array
-    log_evidence: float
+    point: Array  # (k,), with the other coordinates as they were at first
+    drawn: Columns  # (d,), those of these coordinates
+    precision: Array  # (d, d), minus the second derivatives
+    log_evidence: float  # by Laplace's approximation
 
     def has_in_bulk(self, point: Array) -> bool:
         """Whether a point (k,) is no farther away than nearly all draws around the maximum are."""
@@ -59,15 +47,9 @@ class Maximum:
 
 
 class Maxima:
-    """Finds maxima of sub-models.
+    """Finds maxima of sub-models, of a likelihood without noise.
 
-    Parameters
-    ----------
-    density : SubmodelDensity
-    guide : Guide
-        Its draws say of which magnitude a term is.
-    sampler : Sampler
-        Of a likelihood without noise.
+    The draws of the guide say of which magnitude a term is.
     """
 
     def __init__(

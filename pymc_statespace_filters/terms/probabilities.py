@@ -21,23 +21,13 @@ from .submodel_density import Array, Sets
 
 @dataclass(frozen=True)
 class Probabilities:
-    """What evidences of sub-models say about terms.
+    """What evidences of sub-models say about terms."""
 
-    Attributes
-    ----------
-    present : ndarray of bool (S, K)
-        The terms of the sub-models.
-    log_prior, log_evidence, error : ndarray (S,)
-        Of the sub-models; the relative standard errors of the evidences.
-    missed : ndarray (K,), optional
-        How far sub-models that are not among these may move the inclusions.
-    """
-
-    present: Sets
-    log_prior: Array
-    log_evidence: Array
-    error: Array
-    missed: Array | float = 0.0
+    present: Sets  # (S, K), the terms of the sub-models
+    log_prior: Array  # (S,)
+    log_evidence: Array  # (S,)
+    error: Array  # (S,), relative, of the evidences
+    missed: Array | float = 0.0  # (K,), how far other sub-models may move the inclusions
 
     @cached_property
     def of_models(self) -> Array:

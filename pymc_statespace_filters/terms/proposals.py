@@ -39,23 +39,12 @@ N_REFITTED = 4  # components of a mixture fitted to weighted points
 
 @dataclass(frozen=True)
 class Proposal:
-    """The law of a sub-model's parameters from which points are drawn.
+    """The law of a sub-model's parameters from which points are drawn."""
 
-    Attributes
-    ----------
-    present : ndarray of bool (K,)
-        The terms of the sub-model.
-    drawn : ndarray of int
-        The columns that it has.
-    mixture, first : StudentMixture
-        Of the coordinates of the columns ``drawn``; what it was before it was fitted again.
-    coordinates : Coordinates
-    """
-
-    present: Sets
-    drawn: Columns
-    mixture: StudentMixture
-    first: StudentMixture
+    present: Sets  # (K,), the terms of the sub-model
+    drawn: Columns  # that it has
+    mixture: StudentMixture  # of the coordinates of these columns
+    first: StudentMixture  # what it was before it was fitted again
     coordinates: Coordinates
 
     def sample(self, count: int, base: Array, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -91,13 +80,8 @@ class Proposal:
 class Guide:
     """The posterior of the full model, as proposals of its sub-models need it.
 
-    Parameters
-    ----------
-    density : SubmodelDensity
-    draws : ndarray (n, k)
-        Unconstrained.
-    values : ndarray (n, k)
-        The same as the variables have them; NaN for those whose transform changes shape.
+    It is given by unconstrained draws (n, k), and ``values`` (n, k), the same as the variables have
+    them; NaN for those whose transform changes shape.
 
     Raises
     ------

@@ -31,11 +31,7 @@ class Point(NamedTuple):
 class SubmodelDensity:
     """The log-densities of all sub-models.
 
-    Attributes
-    ----------
-    density : SwitchedDensity
-    candidate_of : ndarray of int, shape (k,)
-        The candidate of every column of the unconstrained vector; K for those of none.
+    ``candidate_of`` (k,) is the candidate of every column of the unconstrained vector; K for none.
     """
 
     def __init__(self, model: pm.Model, candidates: Candidates) -> None:

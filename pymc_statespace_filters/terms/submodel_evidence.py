@@ -33,20 +33,12 @@ LEAST_FOR_TAIL = 25  # weights to which a Pareto tail is fitted
 
 @dataclass(frozen=True)
 class Weighted:
-    """Points of a sub-model with their weights, and the law that they come from.
-
-    Attributes
-    ----------
-    proposal : Proposal
-    x : ndarray (n, k)
-    seeds : ndarray of int (n, v)
-    log_weights : ndarray (n,)
-    """
+    """Points of a sub-model with their weights, and the law that they come from."""
 
     proposal: Proposal
-    x: Array
-    seeds: Seeds
-    log_weights: Array
+    x: Array  # (n, k)
+    seeds: Seeds  # (n, v)
+    log_weights: Array  # (n,)
 
     @property
     def count(self) -> int:
@@ -114,24 +106,14 @@ class Weighted:
 class Visits:
     """What chains over sub-models have visited.
 
-    Attributes
-    ----------
-    sets : ndarray of bool (S, K)
-        The sub-models that were met.
-    points : list of Weighted
-        All points of each.
-    frequency, error : ndarray (K,)
-        How often each term was present, and the standard error.
-    alone : ndarray (C,)
-        The share of the visits of each chain to sub-models that no other chain has met.
-    frequency_alone : ndarray (C, K)
-        How often a visit was such a one, with the term present.
+    ``alone`` (C,) is the share of the visits of each chain to sub-models that no other chain has
+    met, and ``frequency_alone`` (C, K) how often a visit was such a one, with the term present.
     """
 
-    sets: Sets
-    points: list[Weighted]
-    frequency: Array
-    error: Array
+    sets: Sets  # (S, K), the sub-models that were met
+    points: list[Weighted]  # all points of each
+    frequency: Array  # (K,), how often each term was present
+    error: Array  # (K,), of the frequency
     alone: Array
     frequency_alone: Array
 
@@ -149,11 +131,7 @@ class Visits:
 class Sampler:
     """Draws points of sub-models and weights them.
 
-    Parameters
-    ----------
-    density : SubmodelDensity
-    base : ndarray (k,)
-        Values for columns that a sub-model does not have.
+    ``base`` (k,) has values for columns that a sub-model does not have.
     """
 
     def __init__(self, density: SubmodelDensity, base: Array, rng: np.random.Generator) -> None:
