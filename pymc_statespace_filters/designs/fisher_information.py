@@ -39,12 +39,7 @@ class Coordinates:
     """What sds are of: logarithms of parameters that are positive, all others as they are.
 
     A variable whose unconstrained vector is shorter than itself, such as a simplex, is taken in the
-    unconstrained space.
-
-    Attributes
-    ----------
-    kinds : ndarray of str, shape (k,)
-        ``"log"``, ``"value"`` or ``"unconstrained"``.
+    unconstrained space. ``kinds`` (k,) are ``"log"``, ``"value"`` or ``"unconstrained"``.
     """
 
     def __init__(self, model: pm.Model) -> None:

@@ -30,16 +30,10 @@ class Place(NamedTuple):
 
 
 class RowSteps:
-    """The steps of a record whose rows come one by one.
+    """The steps of a record whose rows come one by one; ``is_on_grid`` tells of all so far.
 
-    Attributes
-    ----------
-    is_on_grid : bool
-        Whether all rows so far lie on the grid.
-    step, time : int, float
-        Of the last row; -1 and ``t0`` before the first.
-    resets : ndarray
-        Which accumulators start anew after it.
+    ``step`` and ``time`` are those of the last row, -1 and ``t0`` before the first, and ``resets``
+    are the accumulators that start anew after it.
     """
 
     def __init__(

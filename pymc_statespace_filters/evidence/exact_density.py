@@ -24,22 +24,9 @@ Seeds = NDArray[np.int64]
 class ExactDensity:
     """Unbiased estimates of a model's density: its StateSpace variables get another filter.
 
-    Parameters
-    ----------
-    model : pymc.Model
-    filter : filter
-        Exact or unbiased, for the system of every observed StateSpace variable.
-
-    Attributes
-    ----------
-    names : tuple of str
-        The StateSpace variables.
-    is_exact : bool
-        Whether the filter is exact in the mean for all of them.
-    n_noisy : int
-        How many seeds an estimate has: one for each variable, or none if the filter has no noise.
-    on_progress : callable
-        Called with the number of estimates since its last call.
+    ``is_exact`` tells whether the filter is exact in the mean for all of them, which are ``names``,
+    and ``n_noisy`` how many seeds an estimate has: one for each variable, or none without noise.
+    ``on_progress`` is called with the number of estimates since its last call.
 
     Raises
     ------

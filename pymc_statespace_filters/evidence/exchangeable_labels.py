@@ -40,18 +40,8 @@ RARELY = 0.1  # of the share of an order, if all were visited equally
 class OneOrder:
     """Draws and density of declared labels in one order: ascending in the first variable of them.
 
-    Parameters
-    ----------
-    exchangeable : str or iterable
-        As of `estimate_evidence`.
-    density : ModelDensity
-    idata : xarray.DataTree
-
-    Attributes
-    ----------
-    labels : Labels
-    ordered : list of str
-        The variables that a transform keeps in order, so that nothing needs to be sorted.
+    ``exchangeable`` is as of `estimate_evidence`; ``ordered`` are the variables that a transform
+    keeps in order, so that nothing needs to be sorted.
 
     Raises
     ------

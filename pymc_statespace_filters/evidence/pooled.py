@@ -39,23 +39,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Pooled:
-    """Draws (chain, draw) and points (m,) of q, the draws first and chain by chain.
+    """Draws (chain, draw) and points (m,) of q, the draws first and chain by chain."""
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Chains and draws; n in all are followed by the m points of q.
-    log_target, log_approximate, log_q : ndarray (n + m,)
-        The logs of t, a and q at all of them.
-    population : ndarray of int (chain, draw), optional
-        As in `Posterior`.
-    """
-
-    shape: tuple[int, int]
-    log_target: Array
-    log_approximate: Array
-    log_q: Array
-    population: NDArray[np.int64] | None = None
+    shape: tuple[int, int]  # chains and draws; n in all are followed by the m points of q
+    log_target: Array  # (n + m,), the log of t at all of them
+    log_approximate: Array  # (n + m,), that of a
+    log_q: Array  # (n + m,)
+    population: NDArray[np.int64] | None = None  # (chain, draw), as in `Posterior`
 
     @property
     def n_draws(self) -> int:

@@ -24,10 +24,7 @@ type Arrays = dict[str, np.ndarray]
 class StoredSteps:
     """The last step that was stored, and a place for those to come; without a folder neither.
 
-    Attributes
-    ----------
-    found : dict of str to ndarray
-        The last step, on all ranks; empty at the beginning.
+    ``found`` is the last step, on all ranks; empty at the beginning.
     """
 
     def __init__(self, found: Arrays | None = None, checkpoint: RecordFile | None = None) -> None:

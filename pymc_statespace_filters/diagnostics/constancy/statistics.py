@@ -106,13 +106,8 @@ class Statistics(NamedTuple):
 class ConstancyTest:
     """The statistics of a variable's data and of simulated ones.
 
-    Attributes
-    ----------
-    variable : ScoredVariable
-    mode : Modes
-        Of the data.
-    on_progress : callable
-        Called with the number of simulated data sets since its last call.
+    ``mode`` is that of the data; ``on_progress`` is called with the number of simulated data sets
+    since its last call.
     """
 
     def __init__(self, variable: ScoredVariable, durations: Array, start: Array) -> None:

@@ -45,12 +45,7 @@ Array = NDArray[np.float64]
 class ConstantModel:
     """The model with some strengths at zero, as ``pm.do`` makes it.
 
-    Attributes
-    ----------
-    names : tuple of str
-        The strengths.
-    density : ModelDensity
-        Of its other parameters.
+    ``density`` is that of its other parameters.
     """
 
     def __init__(self, model: pm.Model, names: Sequence[str], *, moved: bool) -> None:

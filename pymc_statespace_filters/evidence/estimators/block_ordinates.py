@@ -93,14 +93,9 @@ def estimate_in_blocks(
 ) -> BlockEstimate:
     """Estimate the log-evidence with the point x* and the covariance of `proposal`.
 
-    Parameters
-    ----------
-    proposal : Proposal
-        Fitted to other draws than those of `posterior`.
-    n_blocks : int
-        Blocks of neighbouring coordinates, of nearly equal size; at most k.
-    n_proposals : int
-        Draws of every run, and fresh evaluations in every mean over one.
+    This is fitted to other draws than those of `posterior`. The blocks, at most k, are of
+    neighbouring coordinates and nearly equal size; ``n_proposals`` are the draws of every run, and
+    the fresh evaluations in every mean over one.
     """
     point, chol = proposal.point, proposal.chol
     k = len(point)

@@ -36,27 +36,13 @@ Evaluate = Callable[[Array, Seeds], Array]
 
 @dataclass(frozen=True)
 class Correction:
-    """Draws and defensive points with their weights for the exact posterior.
+    """Draws and defensive points with their weights for the exact posterior."""
 
-    Attributes
-    ----------
-    x : ndarray (n + m, k)
-        The n draws, chain by chain, and m defensive points.
-    seeds : ndarray (n + m, r, v)
-        Of the noise of the r estimates of a point, for each of v variables.
-    log_estimates : ndarray (n + m, r)
-        The log-density of the exact posterior by these estimates.
-    pooled : Pooled
-        Weights for the mean of the estimates.
-    log_fit : ndarray (n + m,)
-        Log-density of the mixture fitted to the draws.
-    """
-
-    x: Array
-    seeds: Seeds
-    log_estimates: Array
-    pooled: Pooled
-    log_fit: Array
+    x: Array  # (n + m, k), the n draws, chain by chain, and m defensive points
+    seeds: Seeds  # (n + m, r, v), of the r estimates of a point, for each of v variables
+    log_estimates: Array  # (n + m, r), of the log-density of the exact posterior
+    pooled: Pooled  # weights for the mean of the estimates
+    log_fit: Array  # (n + m,), log-density of the mixture fitted to the draws
 
     @cached_property
     def weights(self) -> Array:
@@ -108,22 +94,12 @@ def correct(
     rng: np.random.Generator,
     announce: Callable[[str, int], None] = lambda task, total: None,
 ) -> Correction:
-    """Weight draws of a posterior, and points that defend against what they miss.
+    """Weight draws of an approximate posterior, and points that defend against what they miss.
 
-    Parameters
-    ----------
-    posterior : Posterior
-        The approximate one.
-    kept : Posterior
-        The same with those draws that are weighted.
-    evaluate : callable
-        ``evaluate(x, seeds)`` estimates the exact log-density at points x (m, k), r times each:
-        from seeds (m, r, v) to estimates (m, r).
-    seeds_of_point : (int, int)
-        r, as by `seeds_needed`, and v, the number of noisy likelihoods.
-    rng : numpy.random.Generator
-    announce : callable, optional
-        Told what is evaluated next, and the number of estimates.
+    The draws of ``kept``, some of the posterior's, are weighted. ``evaluate(x, seeds)`` estimates
+    the exact log-density at points x (m, k), r times each: from seeds (m, r, v) to estimates
+    (m, r). ``seeds_of_point`` are r, as by `seeds_needed`, and v, the number of noisy likelihoods;
+    ``announce`` is told what is evaluated next, and the number of estimates.
     """
     n_seeds, n_noisy = seeds_of_point
     fit = choose_mixture(posterior, rng)

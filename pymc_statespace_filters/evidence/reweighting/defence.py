@@ -19,7 +19,6 @@ them guided by the fit to those before, and its points serve for nothing else.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +27,7 @@ from scipy.special import logsumexp
 from ...errors import ModelError
 from ...statistics.student_mixture import StudentMixture
 from ..estimators.student_mixture import flattened_copy
-from ..posterior import Posterior
+from ..posterior import Posterior, Prior
 
 SCALE = 3.0  # of the wide part, in widths of the fit to the draws
 N_CLOUD = 2000
@@ -37,21 +36,11 @@ N_ROUNDS, N_SEARCHED = 10, 50  # of the search by the exact likelihood; points i
 Array = NDArray[np.float64]
 
 
-class Law(Protocol):
-    """A distribution on the unconstrained space."""
-
-    def log_density(self, x: Array) -> Array:
-        """Normalised log-density at points (m, k), shape (m,)."""
-
-    def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """Independent points, shape (count, k)."""
-
-
 @dataclass(frozen=True)
 class Mixture:
-    """Several laws with equal weights."""
+    """Several normalised laws with equal weights, which have what a prior has."""
 
-    parts: Sequence[Law]
+    parts: Sequence[Prior]
 
     def log_density(self, x: Array) -> Array:
         """Log-density of points x (m, k), shape (m,)."""
@@ -80,7 +69,7 @@ def defensive_mixture(
     cloud = Mixture([*_proper_prior(posterior, rng), fit.widened(SCALE)])
     x = cloud.sample(N_CLOUD, rng)
     copy = flattened_copy(x, posterior.evaluate(x, rng) - cloud.log_density(x), rng)
-    found: Sequence[Law] = []
+    found: Sequence[Prior] = []
     x, log_ratio = x[:0], np.empty(0)
     for _ in range(N_ROUNDS):
         search = Mixture([*cloud.parts, *found, *found])
@@ -92,7 +81,7 @@ def defensive_mixture(
     return Mixture([*cloud.parts, fit, *copy, *found])
 
 
-def _proper_prior(posterior: Posterior, rng: np.random.Generator) -> list[Law]:
+def _proper_prior(posterior: Posterior, rng: np.random.Generator) -> list[Prior]:
     """The prior, unless it is improper or its density is not that of its draws."""
     prior = posterior.required_prior
     try:
