@@ -8,6 +8,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.sampling.nuts import chains
+from pymc_statespace_filters.sampling.nuts.frame import Frame
 
 STEPS = np.arange(1, 41)
 WALK = psf.StateSpaceModel(
@@ -42,6 +43,13 @@ def test_a_start_where_the_density_is_level_is_taken():
     z = idata["posterior"]["z"].values
     assert abs(z.mean()) < 5 / np.sqrt(2000)
     assert z.std() == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_point_of_infinite_gradient_is_not_warned_of():
+    frame = Frame(np.zeros(2), np.array([[1.0, 0.0], [0.5, 1.0]]))
+    value, gradient = frame.within(lambda x: (-np.inf, np.array([np.inf, -np.inf])))(np.ones(2))
+    assert value == -np.inf
+    assert not np.isfinite(gradient).any()
 
 
 @pytest.mark.parametrize("sampler", ["nuts", "dram"])

@@ -48,7 +48,8 @@ class Frame(NamedTuple):
 
         def in_frame(z: Array) -> tuple[float, Array]:
             value, gradient = evaluate(self.positions(z))
-            return value, gradient @ self.factor
+            with np.errstate(invalid="ignore"):  # an infinite gradient, where the density is zero
+                return value, gradient @ self.factor
 
         return in_frame
 
