@@ -64,12 +64,8 @@ class _Index:
 class RecordFile:
     """A file of records, written by one process, of which any thread may use this object.
 
-    Parameters
-    ----------
-    path : Path
-        If there is no such file, it is made.
-    header : str
-        Identifies the run. That of a file that is there must be the same; see `header_of`.
+    If there is no such file, it is made. The header identifies the run: that of a file that is
+    there must be the same; see `header_of`.
 
     Warns
     -----
@@ -84,13 +80,8 @@ class RecordFile:
     def append(self, key: str, draws: Arrays, state: Arrays) -> None:
         """Write one record; when this returns, it is on the disk.
 
-        Parameters
-        ----------
-        key : str
-        draws : mapping of str to ndarray, shape (new draws, ...)
-            The draws since the last record, under the same names each time; numbers or booleans.
-        state : mapping of str to ndarray
-            The whole state after them.
+        It has the draws (new draws, ...) since the last record, under the same names each time,
+        numbers or booleans, and the whole state after them.
 
         Raises
         ------

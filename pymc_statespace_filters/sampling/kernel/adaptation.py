@@ -83,22 +83,12 @@ def learn(
     stage: int,
     is_free: bool,
 ) -> None:
-    """Adapt to one iteration of warm-up, in place.
+    """Adapt to one iteration of warm-up, in place, after which the chain is at a position (d,).
 
-    Parameters
-    ----------
-    adapt_every : int
-        Iterations in a block.
-    continuous : bool
-        The scheme: ``"continuous"`` or ``"chain"``.
-    state : AdaptationState
-    position : ndarray, shape (d,)
-        Of the chain after the iteration.
-    stage : int
-        The stage whose proposal was accepted, 0 if none was.
-    is_free : bool
-        Whether the proposal was not a random walk of the adapted size. Its draw counts for the
-        covariance, but not for the acceptance rate.
+    A block has ``adapt_every`` iterations; the scheme is ``"continuous"`` or ``"chain"``. The
+    proposal of this stage was accepted, none if it is 0. If the proposal was not a random walk of
+    the adapted size (``is_free``), its draw counts for the covariance, but not for the acceptance
+    rate.
     """
     block = state.block.counts
     _include(state.block, 1.0, position)

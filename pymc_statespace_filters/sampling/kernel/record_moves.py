@@ -75,20 +75,10 @@ _internal = linked()
 def accept_records(estimates, priors, new_estimates, new_priors, log_uniforms, accepted):
     """Accept the proposals of single records, each by its own terms, which are changed in place.
 
-    Parameters
-    ----------
-    estimates, priors : ndarray, shape (G + 1,)
-        Log-density at the current point by record, as estimated when it was accepted.
-    new_estimates, new_priors : ndarray, shape (G + 1,)
-        At the proposed points.
-    log_uniforms : ndarray, shape (G,) or longer
-    accepted : ndarray of int64, shape (G,)
-        Set to 1 where a proposal is accepted, else to 0.
-
-    Returns
-    -------
-    float
-        Mean acceptance probability.
+    The log-densities (G + 1,) by record are those at the current point, as estimated when it was
+    accepted, and at the proposed ones; there are as many ``log_uniforms`` as records, or more.
+    ``accepted`` (G,) is set to 1 where a proposal is, else to 0. Returns the mean acceptance
+    probability.
     """
     n_records, total = accepted.size, 0.0
     for g in range(n_records):

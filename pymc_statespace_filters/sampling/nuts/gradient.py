@@ -18,14 +18,7 @@ Array = NDArray[np.float64]
 
 
 class DensityGradient:
-    """The compiled log-density and gradient of a model without noise.
-
-    Parameters
-    ----------
-    model : pymc.Model
-    raveled : RaveledVariables
-        All its value variables.
-    """
+    """The compiled log-density and gradient of a model without noise, by all its variables."""
 
     def __init__(self, model: Model, raveled: RaveledVariables) -> None:
         values, density = list(raveled.variables), model.logp()

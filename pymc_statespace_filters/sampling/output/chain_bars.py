@@ -97,16 +97,10 @@ class ChainProgress(ProgressBarManager):
     def update(self, chain: int, done: int, stats: Mapping[str, Any], seconds: float = 0.0) -> None:
         """Show how many iterations a chain has made; its clock starts with the first of them.
 
-        Parameters
-        ----------
-        chain : int
-        done : int
-            Its iterations so far, warm-up included. Nothing is drawn if there are no new ones.
-        stats : mapping of str to number
-            "n_failed" of its last draw and, if it is known, "accept_rate", as in ``sample_stats``.
-        seconds : float, optional
-            How long the chain has run, once it has ended: PyMC's bar has no speed for what took
-            less than a quarter of a second.
+        Warm-up is included, and nothing is drawn if there are no new ones. ``stats`` has "n_failed"
+        of its last draw and, if it is known, "accept_rate", as in ``sample_stats``; ``seconds`` is
+        how long it has run, once it has ended: PyMC's bar has no speed for what took less than a
+        quarter of a second.
         """
         done = min(done, self._totals[chain])  # of a checkpoint there may be more
         advance = done - self._done[chain]

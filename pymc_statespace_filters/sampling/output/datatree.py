@@ -46,25 +46,12 @@ def to_datatree(
 
     Without a group ``posterior`` if no chain finished its warm-up.
 
-    Parameters
-    ----------
-    model : pymc.Model
-    raveled : RaveledVariables
-        All value variables of the model, in the order of the positions.
-    chains : list of ChainArrays
-        Warm-up and draws. The list is emptied, to release memory early. If chains were interrupted
-        at different iterations, those are kept, and cut to one length, that give the most draws in
-        all.
-    tune : int
-        Iterations of warm-up, at the beginning of each chain.
-    keep_warmup : bool
-        Whether the warm-up is kept, in separate groups.
-    sampling_time : float
-        In seconds.
-    stat_dims : mapping of str to (str, sequence), optional
-        Name and coordinates of the dimension of statistics that are vectors.
-    attrs : mapping of str to any, optional
-        Attributes of the groups with draws and statistics, in addition to PyMC's.
+    The ``chains`` have warm-up, ``tune`` iterations at the beginning, and draws, of all value
+    variables in the order of ``raveled``. The list is emptied, to release memory early. If chains
+    were interrupted at different iterations, those are kept, and cut to one length, that give the
+    most draws in all. The warm-up is kept in separate groups, if at all. ``stat_dims`` has name and
+    coordinates of the dimension of statistics that are vectors, ``attrs`` attributes of the groups
+    with draws and statistics, in addition to PyMC's.
 
     Raises
     ------

@@ -88,90 +88,47 @@ class EndedChain(ChainFact):
 class EndedRun(ChainFact):
     """The chains of a model at their end, with their draws.
 
-    Attributes
-    ----------
-    names : sequence of str
-        Of the elements of a position.
-    length : Length
-        Draws that chains were to have after the warm-up.
-    seconds : float
-        That sampling took.
-    convergence : Convergence, optional
-        The diagnostics, if they were asked for and there are enough draws.
-    positions : ndarray, shape (n, k)
-        Draws of the unconstrained space, some of them if they are many.
-    rngs : (numpy.random.Generator, numpy.random.Generator)
-        For the search of missed parts and the check of filters.
-    is_complete : bool
-        Whether all chains have made as many iterations as they were to.
-    options : ExecutionOptions
-        Which checks were asked for, and the level of the report.
-    goes_on : bool
-        Whether `sample(continue_from=)` takes the draws.
+    ``positions`` (n, k) are draws of the unconstrained space, some of them if they are many;
+    ``rngs`` are for the search of missed parts and the check of filters.
     """
 
-    goes_on = False
+    goes_on = False  # whether `sample(continue_from=)` takes the draws
     model: Model
     target: Target | RecordTarget
     request: SamplingRequest
     tree: DataTree
-    names: Sequence[str]
-    length: Length
-    seconds: float
-    convergence: Convergence | None
+    names: Sequence[str]  # of the elements of a position
+    length: Length  # draws that chains were to have after the warm-up
+    seconds: float  # that sampling took
+    convergence: Convergence | None  # if it was asked for and there are enough draws
     positions: np.ndarray
     rngs: tuple[np.random.Generator, np.random.Generator]
-    is_complete: bool
-    options: ExecutionOptions
+    is_complete: bool  # all chains have made as many iterations as they were to
+    options: ExecutionOptions  # which checks were asked for, and the level of the report
 
 
 @dataclass(frozen=True)
 class EndedDram(EndedRun):
-    """Chains of DRAM.
-
-    Attributes
-    ----------
-    lengths : sequence of int
-        Draws of each chain, with those of the warm-up.
-    chains : mapping
-        Those that have draws after the warm-up, by their number.
-    lower : sequence of LowerChain
-        Chains that stayed far below the highest one.
-    below : float, optional
-        By how many nats all stayed below the points that the search for starts has found.
-    spread : (int, SeedSpread), optional
-        That of the estimates at the highest draw, and whose it is.
-    """
+    """Chains of DRAM."""
 
     goes_on = True
-    lengths: Sequence[int]
-    chains: Mapping[int, EndedChain]
-    lower: Sequence[LowerChain]
-    below: float | None
-    spread: tuple[int, SeedSpread] | None
+    lengths: Sequence[int]  # draws of each chain, with those of the warm-up
+    chains: Mapping[int, EndedChain]  # those that have draws after the warm-up, by their number
+    lower: Sequence[LowerChain]  # chains that stayed far below the highest one
+    below: float | None  # nats by which all stayed below the points of the search for starts
+    spread: tuple[int, SeedSpread] | None  # of the estimates at the highest draw, and whose it is
 
 
 @dataclass(frozen=True)
 class EndedNuts(EndedRun):
-    """Chains of NUTS.
+    """Chains of NUTS."""
 
-    Attributes
-    ----------
-    diverging, energy, n_steps : ndarray, shape (chains, draws)
-    is_stuck : bool
-        Whether they diverged, and ended as more iterations had not helped.
-    is_beaten : bool
-        Whether they ended as another sampler takes less.
-    n_gradients : int
-        With those of the warm-up.
-    """
-
-    diverging: np.ndarray
+    diverging: np.ndarray  # (chains, draws), as the next two
     energy: np.ndarray
     n_steps: np.ndarray
-    is_stuck: bool
-    is_beaten: bool
-    n_gradients: int
+    is_stuck: bool  # they diverged, and ended as more iterations had not helped
+    is_beaten: bool  # they ended as another sampler takes less
+    n_gradients: int  # with those of the warm-up
 
     @property
     def diverges(self) -> bool:

@@ -25,19 +25,10 @@ from .thinned_draws import Thinning
 
 
 class Chain(ChainArrays):
-    """A Markov chain of a prepared target.
+    """A Markov chain of a prepared target, which keeps ``n_rows`` draws.
 
-    Parameters
-    ----------
-    target : Target
-    key : ndarray of uint64, shape (2,)
-        Key of the chain's random numbers.
-    n_rows, n_covs : int
-        Draws that are kept, and the first iterations whose proposal covariance is.
-    proposal_cov : ndarray, shape (d, d), optional
-        Of the first proposals. Default: the target's.
-    thinning : Thinning, optional
-        Which iterations are kept. Default: all.
+    ``key`` (2,) is that of its random numbers, ``n_covs`` the number of first iterations whose
+    proposal covariance is kept, and ``proposal_cov`` (d, d) that of the first proposals.
     """
 
     _target: Target

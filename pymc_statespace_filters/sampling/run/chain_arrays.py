@@ -38,26 +38,9 @@ class StopRequested(Exception):
 class ChainArrays:
     """State and draws of a chain; what its iterations do is in the classes derived from this one.
 
-    Parameters
-    ----------
-    target : Target or RecordTarget
-        Prepared.
-    state : ChainState
-    n_rows : int
-        Draws that are kept.
-    n_counts : int
-        Columns of the counts of a draw.
-    covs : ndarray, shape (n_covs, d, d)
-        For the proposal covariances of the first iterations.
-    thinning : Thinning, optional
-        Which iterations are kept. Default: all.
-
-    Attributes
-    ----------
-    state : ChainState
-    draws : Draws
-    control : ndarray of int64, shape (2,)
-        The control block, with the cells PAUSE_REQUESTED and N_DONE.
+    Of the draws ``n_rows`` are kept, each with ``n_counts`` counts, and ``covs`` (n_covs, d, d) is
+    for the proposal covariances of the first iterations. ``control`` (2,) is the control block,
+    with the cells PAUSE_REQUESTED and N_DONE.
     """
 
     def __init__(

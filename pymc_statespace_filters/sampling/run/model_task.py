@@ -49,16 +49,9 @@ def key_of_chain(index: int) -> str:
 class ModelTask:
     """The chains of a model, stored in its ``checkpoint`` if that is set.
 
-    Parameters
-    ----------
-    model : pymc.Model
-    request : SamplingRequest
-    name : str
-        For messages; empty if there is only one model.
-    group : Communicator, optional
-        Ranks that evaluate the likelihoods together, of which this is the first.
-    target : Target or RecordTarget, optional
-        The model's, if it has been made already.
+    ``name`` is for messages, and empty if there is only one model; ``group`` are the ranks that
+    evaluate the likelihoods together, of which this is the first. The ``target`` is given if it has
+    been made already.
 
     Raises
     ------

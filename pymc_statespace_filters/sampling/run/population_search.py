@@ -52,19 +52,8 @@ def generator_of(request: SamplingRequest, *key: int) -> np.random.Generator:
 class WarmUp:
     """The mixture, fitted to a population and, after each part of the warm-up, to all chains.
 
-    Parameters
-    ----------
-    request : SamplingRequest
-    dim : int
-        Of the mixture; 0 for chains that have none.
-    population : ndarray, shape (m, d), optional
-    is_noisy : bool
-        Whether the likelihood is an estimate.
-
-    Attributes
-    ----------
-    mixture : ndarray
-        Packed, of the current part.
+    The population (m, d) may be None; ``dim`` is that of the mixture, 0 for chains that have none,
+    and ``mixture`` is packed, of the current part.
     """
 
     def __init__(

@@ -71,18 +71,7 @@ def _apart(position: np.ndarray, own: np.ndarray, rng: np.random.Generator) -> n
 
 
 class RecordChain(ChainArrays):
-    """A Markov chain of a prepared target with records.
-
-    Parameters
-    ----------
-    target : RecordTarget
-    key : ndarray of uint64, shape (2,)
-        Key of the chain's random numbers.
-    n_rows : int
-        Draws that are kept.
-    thinning : Thinning, optional
-        Which iterations are kept. Default: all.
-    """
+    """A Markov chain of a prepared target with records; its arguments are those of `Chain`."""
 
     _target: RecordTarget
 

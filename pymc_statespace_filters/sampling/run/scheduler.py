@@ -215,13 +215,8 @@ class ConvergenceDisplay:
     """Computes the diagnostics of each model that runs, and shows them below the bars.
 
     They are those of the chains whose draws are on this rank: of those that run here, and of those
-    that have ended anywhere. Without a bar nothing is computed.
-
-    Parameters
-    ----------
-    bars : ChainProgress
-    chains : int
-        Number of chains of a model; they are numbered through all models.
+    that have ended anywhere. Without a bar nothing is computed. A model has so many ``chains``,
+    numbered through all models.
     """
 
     def __init__(self, bars: ChainProgress, chains: int):

@@ -39,22 +39,10 @@ class StartDraws:
     """Draws from the prior, as candidates for starts and as a measure of scale.
 
     PyMC does not pass ``initvals`` to a step method. The user's choice is recognised by a start
-    that differs from the model's initial point, or by an ``initval`` in the model; values equal to
-    the model's initial point are not recognised.
+    that differs from the model's initial point, ``default``, or by an ``initval`` in the model;
+    values equal to the initial point are not recognised.
 
-    Parameters
-    ----------
-    model : pymc.Model
-    raveled : RaveledVariables
-    default : mapping of str to ndarray
-        The model's initial point.
-
-    Attributes
-    ----------
-    draws : ndarray, shape (n, d)
-        The first batch.
-    is_prior : bool
-        Whether all priors can be drawn from.
+    ``draws`` (n, d) are the first batch; ``is_prior`` tells whether all priors can be drawn from.
     """
 
     def __init__(self, model: Model, raveled: RaveledVariables, default: Mapping[str, np.ndarray]):
@@ -159,14 +147,8 @@ def chain_candidates(
 ) -> list[Callable[[np.random.Generator], Sequence[np.ndarray]]]:
     """For each chain, a function from its generator to the candidates for its start.
 
-    Parameters
-    ----------
-    initvals : None, mapping, or sequence of these
-        As in ``pm.sample``.
-    seeds : sequence of numpy.random.SeedSequence
-        One for each chain.
-    disperse : bool
-        Whether candidates are drawn from the prior if no initial values are given.
+    ``initvals`` are as in ``pm.sample``; without any, candidates are drawn from the prior to
+    ``disperse`` the starts.
 
     Raises
     ------

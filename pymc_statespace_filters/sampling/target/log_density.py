@@ -37,33 +37,18 @@ from .leader_follower import Leader, leader_errors
 class LogDensity:
     """Compiled log-density of a model on its unconstrained space, with its noise as an argument.
 
-    The value variables that are not raveled are further arguments, in the order of their names,
-    ``others``.
+    The continuous value ``variables`` are raveled into one vector, in this order; the others are
+    further arguments, in the order of their names, ``others``. Any ``point`` of the model has the
+    first values of all arguments, and ``seeds`` are the noise seeds, by the name of their
+    StateSpace variable.
 
-    Parameters
-    ----------
-    model : pymc.Model
-    variables : sequence of TensorVariable
-        Continuous value variables that are raveled into one vector, in this order.
-    point : mapping of str to ndarray
-        Any point of the model, as the first values of all arguments.
-    seeds : mapping of str to shared variable
-        The noise seeds, by the name of their StateSpace variable.
-    compile_kwargs : dict, optional
-        Passed to PyMC's compiler.
-    fixed_noise : bool
-        Whether every evaluation uses the noise of the model's seeds. Their normals are then drawn
-        once, in `prepare`, and the seeds of a call are not read.
-    correlation : float, optional
-        If given, the normals of an evaluation are ``correlation`` times those carried by the chain
-        plus fresh ones, of the same variance.
-    graph : TensorVariable, optional
-        The log-density if it is not the model's own, see `screening_density`.
-    group : Communicator, optional
-        Ranks that evaluate the noisy likelihoods together. The first, this one, evaluates the
-        log-density; the others call `leader_follower.follow`.
-    with_gradient : bool
-        Whether the last result of `at_rows` is the gradient.
+    With ``fixed_noise`` every evaluation uses the noise of the model's seeds. Their normals are
+    then drawn once, in `prepare`, and the seeds of a call are not read. With a ``correlation`` the
+    normals of an evaluation are so many times those carried by the chain plus fresh ones, of the
+    same variance. ``graph`` is the log-density if it is not the model's own, see
+    `screening_density`. The ranks of a ``group`` evaluate the noisy likelihoods together: this one,
+    the first, evaluates the log-density; the others call `leader_follower.follow`. The gradient, if
+    wanted, is the last result of `at_rows`.
 
     Raises
     ------
@@ -202,17 +187,7 @@ class BoundLogDensity:
     def __call__(
         self, position: np.ndarray, others: Sequence[np.ndarray], seeds: ArrayLike
     ) -> Evaluation:
-        """Evaluate once, from Python; an exception of the model is raised.
-
-        Parameters
-        ----------
-        position : ndarray, shape (d,)
-            The raveled variables.
-        others : sequence of ndarray
-            Values of the other variables.
-        seeds : array_like of int64, shape (noisy,)
-            The noise seeds; not read if the noise is fixed.
-        """
+        """Evaluate once, from Python, at a position (d,); an exception of the model is raised."""
         self.native.position[:] = position
         self.native.seeds[:] = seeds
         for mine, value in zip(self.others, others, strict=True):

@@ -44,16 +44,8 @@ from .target import Target
 class RecordDensities:
     """Compiled log-density of a model, by record, with its noise as an argument.
 
-    Parameters
-    ----------
-    model : pymc.Model
-    structure : PanelStructure
-    variables : sequence of TensorVariable
-        All value variables of the model, in the order of the vector into which they are raveled.
-    point : mapping of str to ndarray
-        Any point of the model.
-    seeds : mapping of str to shared variable
-        The noise seeds, by the name of their StateSpace variable.
+    All value ``variables`` of the model are in the order of the vector into which they are raveled;
+    the other arguments are as of `LogDensity`.
     """
 
     def __init__(
@@ -161,26 +153,11 @@ def _inputs(position: np.ndarray, seeds: np.ndarray) -> list[np.ndarray]:
 
 
 class RecordTarget(SampledModel):
-    """A model whose records are moved one by one.
+    """A model whose records, of these ``labels``, are moved one by one.
 
-    Parameters
-    ----------
-    model : pymc.Model
-    settings : RandomWalkSettings
-    structure : PanelStructure
-    proposal_cov : array_like, shape (d, d), optional
-        Of the first proposals; each block takes its own part.
-    of_all : bool
-        Whether that covariance is one of proposals of all parameters together, as of a pilot. It
-        has the factor 2.38^2 / d of their number, and each block that of its own.
-
-    Attributes
-    ----------
-    structure : PanelStructure
-    labels : tuple
-        Of the records.
-    densities : RecordDensities
-    layout : RecordLayout
+    Of the covariance ``proposal_cov`` (d, d) of the first proposals each block takes its own part.
+    If it is one of proposals of all parameters together (``of_all``), as of a pilot, it has the
+    factor 2.38^2 / d of their number, and each block that of its own.
 
     Raises
     ------

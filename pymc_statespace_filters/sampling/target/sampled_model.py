@@ -31,21 +31,10 @@ class Growth(NamedTuple):
 class SampledModel:
     """A model, the variables that a sampler moves, their prior draws and noise seeds.
 
-    Parameters
-    ----------
-    model : pymc.Model
-    vars : sequence of TensorVariable, optional
-        Continuous variables to sample. Default: all.
-    settings : RandomWalkSettings
-
-    Attributes
-    ----------
-    exact : bool
-        Whether the chains target the posterior itself, without the bias of a filter's noise.
-    seed_names : tuple of str
-        Names of the noise seeds, one for each noisy StateSpace variable.
-    samples_all : bool
-        Whether no other step method moves continuous variables.
+    ``vars`` are continuous variables, by default all; ``samples_all`` tells whether no other step
+    method moves further ones. ``exact`` tells whether the chains target the posterior itself,
+    without the bias of a filter's noise, and ``seed_names`` has the noise seeds, one for each noisy
+    StateSpace variable.
 
     Raises
     ------

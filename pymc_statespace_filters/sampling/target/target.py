@@ -36,17 +36,8 @@ _MOST_CURVED = 512  # dimensions; the curvature takes two gradients for each
 class Target(SampledModel):
     """A model as the sampler sees it, whose variables are moved together.
 
-    Parameters
-    ----------
-    model, vars, settings
-        As `SampledModel`.
-    proposal_cov : array_like, shape (d, d), optional
-    compile_kwargs : dict, optional
-        Passed to PyMC's compiler.
-    graph : TensorVariable, optional
-        The log-density, if it is not the model's own.
-    group : Communicator, optional
-        Ranks that evaluate the noisy likelihoods together, of which this is the first.
+    ``proposal_cov`` (d, d) is of the first proposals; ``compile_kwargs``, ``graph`` and ``group``
+    are as of `LogDensity`.
 
     Raises
     ------

@@ -17,12 +17,8 @@ from ...pymc_model.inspection import log_density_terms
 class RaveledVariables:
     """Value variables raveled into one vector, by PyMC's `DictToArrayBijection`.
 
-    Parameters
-    ----------
-    variables : sequence of TensorVariable
-        Value variables, in the order of the vector.
-    point : mapping of str to ndarray
-        Any point of the model; only shapes and dtypes are read.
+    The variables are in the order of the vector. Of ``point``, any point of the model, only shapes
+    and dtypes are read.
     """
 
     def __init__(self, variables: Sequence[TensorVariable], point: Mapping[str, np.ndarray]):
