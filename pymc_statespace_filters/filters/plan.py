@@ -107,17 +107,9 @@ def make_plan(
 ) -> Plan:
     """Pack a system, those of its functions that a filter uses, and the filter's settings.
 
-    Parameters
-    ----------
-    system : System
-    run : EntryPoint
-        The function that the plan is for.
-    functions : sequence of str
-        Names of functions of the system, as in `PLAN`; `prepare` is there with any of them.
-    settings : sequence of float
-        What the function reads by `settings_of`.
-    **others : int or EntryPoint
-        Values of further slots.
+    The plan is for the function ``run``. The functions of the system have names as in `PLAN`, and
+    `prepare` is there with any of them; the settings are read by `settings_of`, and ``others`` are
+    values of further slots.
     """
     used = {n: system.entry_point(n) for n in (("prepare", *functions) if functions else ())}
     numbers = {name: value for name, value in others.items() if isinstance(value, int)}

@@ -33,15 +33,9 @@ class ColumnAllgather:
     """Gather the columns of arrays in machine code's memory, in place and on all ranks.
 
     Every rank has computed some of the columns, in whole blocks, as `filters.ensemble.reductions`
-    divides them.
-
-    Attributes
-    ----------
-    address : int
-        Address of a C function of an array's address, rows, columns and columns per block.
-    error : BaseException or None
-        Exception of the function, which machine code cannot raise. After it the function does
-        nothing.
+    divides them. ``address`` is that of a C function of an array's address, rows, columns and
+    columns per block, and ``error`` its exception, which machine code cannot raise. After it the
+    function does nothing.
     """
 
     def __init__(self, comm: Any):
@@ -308,13 +302,8 @@ class Communicator:
 def communicator_of(comm: Any, *, in_lockstep: bool = True) -> Communicator:
     """Make a `Communicator` of the argument ``comm``, on all its ranks.
 
-    Parameters
-    ----------
-    comm : None, "world", or mpi4py.MPI.Intracomm
-        "world" is all ranks that mpiexec started, or this process alone without mpiexec.
-    in_lockstep : bool
-        Whether several ranks will evaluate one likelihood, so that their environments must be
-        equal.
+    "world" is all ranks that mpiexec started, or this process alone without mpiexec. Ranks in
+    lockstep will evaluate one likelihood, so that their environments must be equal.
 
     Raises
     ------

@@ -33,17 +33,10 @@ def describe_environment() -> dict[str, str]:
 
 
 def check_environments(reports: list[dict[str, str]], rank: int, *, in_lockstep: bool) -> None:
-    """Check that all ranks have the same software and processor.
+    """Check that all ranks have the same software and processor, by `describe_environment` of each.
 
-    Parameters
-    ----------
-    reports : list of dict
-        `describe_environment` of every rank.
-    rank : int
-        That of this process.
-    in_lockstep : bool
-        Whether several ranks evaluate one likelihood, so that their results must be bitwise equal.
-        Otherwise each runs whole chains, which are correct in any environment.
+    Ranks in lockstep evaluate one likelihood, so that their results must be bitwise equal.
+    Otherwise each runs whole chains, which are correct in any environment.
 
     Raises
     ------

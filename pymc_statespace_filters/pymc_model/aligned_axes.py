@@ -49,14 +49,8 @@ def follow(
 ) -> dict[Variable, Status]:
     """The status of every variable of the graphs.
 
-    Parameters
-    ----------
-    graphs : sequence of Variable
-    values : iterable of Variable
-        Values of free variables, whose first axis runs over the records.
-    n_records : int
-    point : mapping of str to ndarray
-        Any point of the model, for the lengths of its variables.
+    The ``values`` of free variables have a first axis that runs over the records. Any ``point`` of
+    the model tells the lengths of its variables.
     """
     values = list(values)
     rows = tuple(range(n_records))

@@ -121,15 +121,8 @@ def centring_of(
 ) -> Centring:
     """The coordinates in which a value enters the likelihoods, as far as they are seen.
 
-    Parameters
-    ----------
-    value : TensorVariable
-        With a row for each record; the columns of a table may enter each on its own.
-    likelihoods : sequence of Variable
-    status : mapping of Variable to Aligned
-        Of what depends on values that belong to single records.
-    point : mapping of str to ndarray
-        Any point of the model, for the lengths of its variables.
+    It has a row for each record; the columns of a table may enter each on its own. The status is
+    that of what depends on values that belong to single records, see `follow`.
     """
     clients = _clients(value, likelihoods)
     n_columns = np.shape(point[value.name])[-1]

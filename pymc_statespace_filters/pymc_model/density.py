@@ -83,18 +83,11 @@ def check_free_variables(model: pm.Model) -> None:
 class RowFunction:
     """A scalar function of a model's free variables, compiled over their flat vector.
 
-    ``output`` is a scalar graph of the model's value variables; the noise seeds become arguments.
-    ``extra`` are graphs that `calls` evaluates, too, and the gradient, if wanted, is its last
-    result. The variables of the graphs may be others, those of ``point``.
-
-    Attributes
-    ----------
-    seed_names : tuple of str
-        Names of the noisy state-space variables, in the order of the columns of a seed array.
-    model_seeds : ndarray of int64
-        The model's seeds for them.
-    calls : Rows
-        From points (m, k) and their m seeds of each variable to the results (m, ...).
+    ``output`` is a scalar graph of the model's value variables; the noise seeds become arguments,
+    in the order of the noisy variables ``seed_names``, whose seeds in the model are
+    ``model_seeds``. ``calls`` leads from points (m, k) and their m seeds of each variable to the
+    results (m, ...), those of the graphs ``extra`` with them; the gradient, if wanted, is the last.
+    The variables of the graphs may be others, those of ``point``.
     """
 
     def __init__(

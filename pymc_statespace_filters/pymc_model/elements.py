@@ -27,18 +27,13 @@ Columns = tuple[int, ...]
 class Elements:
     """What the k columns of a model's unconstrained vector are called.
 
-    Attributes
-    ----------
-    labels : tuple of str
-        For every column: by coordinates where its dimensions have them, by position elsewhere.
-    variables : tuple of str
-        The variable of every column.
-    meanings : mapping
-        Names of variables and elements, each with all sets of columns that it may stand for.
+    Each has a label by coordinates where its dimensions have them, by position elsewhere.
+    ``meanings`` has names of variables and elements, each with all sets of columns that it may
+    stand for.
     """
 
     labels: tuple[str, ...]
-    variables: tuple[str, ...]
+    variables: tuple[str, ...]  # of every column
     meanings: Mapping[str, frozenset[Columns]]
 
     @classmethod

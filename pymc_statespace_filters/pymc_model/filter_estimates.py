@@ -31,14 +31,8 @@ Array = NDArray[np.float64]
 class VariableAtPoints:
     """An observed StateSpace variable, or all records of a panel, at points of its model.
 
-    Parameters
-    ----------
-    model : pymc.Model
-        With continuous free variables.
-    name : str
-        Of the variable.
-    x : ndarray, shape (m, k)
-        Points of the unconstrained space, in the order of `unconstrained_draws`.
+    The model has continuous free variables; points x (m, k) are of the unconstrained space, in the
+    order of `unconstrained_draws`.
     """
 
     def __init__(self, model: pm.Model, name: str, x: Array) -> None:

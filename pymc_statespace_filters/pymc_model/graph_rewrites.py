@@ -28,15 +28,10 @@ from .inspection import likelihood_nodes, noisy_filters, state_space_nodes
 class CallbackLikelihoods(NamedTuple):
     """The symbols of `with_likelihood_callback`.
 
-    Attributes
-    ----------
-    kinds : tuple of (StateSpaceModel, filter)
-        The likelihoods that the callback evaluates; it is called with an index into them.
-    address : TensorVariable
-        Input: the address of the callback; at 0 the filters evaluate.
-    normals : dict of TensorVariable to TensorVariable
-        Inputs, each with the expression of its values, which depends only on the seed and on the
-        steps of the record. With an empty vector the filter draws from its seed.
+    The callback evaluates likelihoods of these ``kinds``, and is called with an index into them.
+    The input ``address`` is its address; at 0 the filters evaluate. ``normals`` are inputs, each
+    with the expression of its values, which depends only on the seed and on the steps of the
+    record. With an empty vector the filter draws from its seed.
     """
 
     kinds: tuple[tuple[StateSpaceModel, Filter], ...]
@@ -74,24 +69,12 @@ def with_likelihood_callback(
 
 
 class AutoregressiveNoise(NamedTuple):
-    """The symbols of `autoregressive_noise`; one entry per noisy variable.
+    """The symbols of `autoregressive_noise`; one entry per noisy variable."""
 
-    Attributes
-    ----------
-    correlation : TensorVariable
-        Input, from 0 to 1: the correlation of the moved normals with the current ones.
-    normals : tuple of TensorVariable
-        Inputs: the current normals, finite, ``sizes`` of them.
-    moved : tuple of TensorVariable
-        The moved normals, which are stored if the move is accepted.
-    sizes : tuple of TensorVariable
-        Number of normals, a function of the steps of the record alone.
-    """
-
-    correlation: TensorVariable
-    normals: tuple[TensorVariable, ...]
-    moved: tuple[TensorVariable, ...]
-    sizes: tuple[TensorVariable, ...]
+    correlation: TensorVariable  # input, from 0 to 1: of the moved normals with the current ones
+    normals: tuple[TensorVariable, ...]  # inputs: the current ones, finite, ``sizes`` of them
+    moved: tuple[TensorVariable, ...]  # which are stored if the move is accepted
+    sizes: tuple[TensorVariable, ...]  # numbers, functions of the steps of the record alone
 
 
 def autoregressive_noise(

@@ -201,11 +201,6 @@ class ModelFactors:
     The likelihood is everything in the model except the priors of the free variables, Potentials
     included. It is evaluated by itself: far out in a prior, its difference from the log-density has
     no digits. The Jacobians of the transforms belong to the prior.
-
-    Attributes
-    ----------
-    likelihood : RowFunction
-    prior : ModelPrior
     """
 
     def __init__(self, model: pm.Model) -> None:

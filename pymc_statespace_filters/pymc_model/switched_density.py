@@ -30,18 +30,10 @@ Columns = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Switches:
-    """Scalars of the flat unconstrained vector that K switches hold together.
+    """Scalars of the flat unconstrained vector that K switches hold together."""
 
-    Attributes
-    ----------
-    columns : tuple of ndarray of int
-        Columns of the vector, for each switch.
-    values : tuple of ndarray
-        The values, as the model's variables have them, at which these are held.
-    """
-
-    columns: tuple[Columns, ...]
-    values: tuple[Array, ...]
+    columns: tuple[Columns, ...]  # of the vector, for each switch
+    values: tuple[Array, ...]  # as the model's variables have them, at which these are held
 
     def __len__(self) -> int:
         return len(self.columns)
@@ -64,18 +56,12 @@ class Switches:
 class DensityInParts(NamedTuple):
     """The log-density of a model at points, and the priors of its blocks.
 
-    Attributes
-    ----------
-    total : ndarray (m,)
-        -inf instead of NaN.
-    own : ndarray (m, blocks)
-        What the prior of each block, given others, adds to it, with the Jacobian; zero if held.
-    held : ndarray (m, blocks)
-        The log-density of each block at the values at which it is held, given the others; it is no
-        part of the total, and zero if nothing is held.
+    ``own`` (m, blocks) is what the prior of each block, given others, adds to the total, with the
+    Jacobian; zero if held. ``held`` (m, blocks) is the log-density of each block at the values at
+    which it is held, given the others; it is no part of the total, and zero if nothing is held.
     """
 
-    total: Array
+    total: Array  # (m,), -inf instead of NaN
     own: Array
     held: Array
 
@@ -83,18 +69,9 @@ class DensityInParts(NamedTuple):
 class SwitchedDensity(RowFunction):
     """The log-density of a model with some scalars held, at many points.
 
-    Parameters
-    ----------
-    model : pymc.Model
-        With continuous free variables.
-    switches : Switches
-        Of elements of variables whose elements have densities of their own.
-
-    Attributes
-    ----------
-    blocks : ndarray of int, shape (k,)
-        For every column of the unconstrained vector the number of its block: an element, or a
-        variable whose elements have a joint density alone.
+    Free variables are continuous, and the switches are of elements with densities of their own.
+    ``blocks`` (k,) has for every column of the unconstrained vector the number of its block: an
+    element, or a variable whose elements have a joint density alone.
 
     Raises
     ------

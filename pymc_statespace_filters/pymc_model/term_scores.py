@@ -52,22 +52,9 @@ class Scores(NamedTuple):
 class ScoredVariable:
     """An observed StateSpace variable, or a panel, with data sets in place of its own.
 
-    Parameters
-    ----------
-    model : pymc.Model
-    name : str
-        Of the variable, with a filter that is smooth and without noise.
-
-    Attributes
-    ----------
-    system, filter, clock
-    records : Records
-    t0 : ndarray ()
-    of_rows : ndarray (J,)
-        The number of the record of each row.
-    times : ndarray (J,)
-        The model time of each row; `t0` is that of step 0.
-    observed : ndarray (J, p)
+    Its filter is smooth and without noise. Of the J rows of its data ``observed`` (J, p), there are
+    the numbers ``of_rows`` (J,) of their records and the model ``times`` (J,); ``t0`` is that of
+    step 0.
     """
 
     def __init__(self, model: pm.Model, name: str) -> None:

@@ -96,16 +96,9 @@ _TYPES = {FLOAT: DOUBLE, INTEGER: INT, BOOLEAN: BOOL}
 class Emitter:
     """Emits the instructions that compute expressions, each at most once.
 
-    Parameters
-    ----------
-    module : Module
-        Where the functions that they call are declared.
-    builder : llvmlite.ir.IRBuilder
-        Stands where the instructions belong.
-    read : callable
-        Emits the value of an input, given its name.
-    vector : bool
-        Whether the code is inside a loop that must vectorise.
+    The functions that they call are declared in the module; the builder stands where they belong.
+    ``read`` emits the value of an input, given its name, and ``vector`` tells whether the code is
+    inside a loop that must vectorise.
     """
 
     def __init__(

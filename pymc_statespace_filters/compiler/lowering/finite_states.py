@@ -49,30 +49,18 @@ class Moves:
 class FiniteStates:
     """The finite states of a system.
 
-    Attributes
-    ----------
-    indices : tuple of int
-        Which states of the system are finite.
-    continuous : tuple of int
-        The others.
-    why_not : mapping of str to str
-        Why each of the others is none of them, by its name.
-    joint : ndarray of float, shape (K, len(indices))
-        The joint values that the system may reach, in lexicographic order.
-    start, step : Moves
-        The possible values at step 0, and what a step may do.
-    unbounded : tuple of int
-        The finite variables of ``process_dist`` whose values depend on other things than finite
-        states, such as a binomial one whose number of trials is a parameter; ``values`` of moves
-        are NaN there.
+    ``joint`` (K, len(indices)) are the joint values that the system may reach, in lexicographic
+    order. ``unbounded`` are the finite variables of ``process_dist`` whose values depend on other
+    things than finite states, such as a binomial one whose number of trials is a parameter;
+    ``values`` of moves are NaN there.
     """
 
-    indices: tuple[int, ...]
-    continuous: tuple[int, ...]
-    why_not: Mapping[str, str]
+    indices: tuple[int, ...]  # which states of the system are finite
+    continuous: tuple[int, ...]  # the others
+    why_not: Mapping[str, str]  # why each of the others is none of them, by its name
     joint: np.ndarray
-    start: Moves
-    step: Moves
+    start: Moves  # the possible values at step 0
+    step: Moves  # what a step may do
     unbounded: tuple[int, ...]
 
 

@@ -282,19 +282,10 @@ def plan_words(plan, version):
 class Plan:
     """A plan, and the symbol by which graphs refer to it; its words are filled in on first use.
 
-    Parameters
-    ----------
-    words : ndarray of int64
-        Without the header and the addresses.
-    version : int
-        Of the layout, see `version_of`.
-    run : EntryPoint
-        The function to call.
-    functions : mapping of int to EntryPoint
-        Functions whose addresses belong to these slots.
-    key : str or None
-        Identifies functions, sizes and settings, in any process; None if one of them cannot be
-        cached on disk.
+    It is given without the header and the addresses, with the version of its layout (see
+    `version_of`), the function to run, and those whose addresses belong to these slots. The key
+    identifies functions, sizes and settings, in any process; it is None if one of them cannot be
+    cached on disk.
     """
 
     def __init__(

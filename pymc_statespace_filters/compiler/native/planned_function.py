@@ -88,13 +88,8 @@ def _vectors(words: array) -> tuple[int, int, int]:
 class PlannedFunction:
     """A compiled function of arrays and numbers, of which a plan is the machine code.
 
-    Parameters
-    ----------
-    plan : Plan
-    arguments : sequence of (str, int)
-        Names and dimensions, see `plan.ARGUMENTS`.
-    results : sequence of (str, int)
-        Names and dimensions, see `plan.SHAPES`; one result is returned as it is.
+    Arguments and results have names and dimensions, see `plan.ARGUMENTS` and `plan.SHAPES`; a
+    single result is returned as it is.
     """
 
     def __init__(self, plan: Plan, arguments: Names, results: Names) -> None:

@@ -30,13 +30,9 @@ _N_ADDRESSES = 2  # of adapter and function, before those of the inputs
 class Call(NamedTuple):
     """Arguments and results of a call from machine code, for one thread at a time.
 
-    Attributes
-    ----------
-    table : ndarray of int64
-        Addresses of the adapter, of the function and of its inputs; the inputs' shapes; and the
-        length of ``out``.
-    out : ndarray, shape (1 + n,)
-        First 0, or 1 if the function raised; then the results, one after the other.
+    ``table`` has the addresses of the adapter, of the function and of its inputs; the inputs'
+    shapes; and the length of ``out``. This (1 + n,) is first 0, or 1 if the function raised; then
+    the results, one after the other.
     """
 
     table: np.ndarray

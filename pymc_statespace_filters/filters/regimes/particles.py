@@ -36,17 +36,10 @@ from .hybrid import Hybrid, Symbols, hybrid_of
 
 @dataclass(frozen=True, eq=False)
 class HybridParticles:
-    """The system of the particles, and what an observation does to them.
-
-    Attributes
-    ----------
-    hybrid : Hybrid
-    system : CompiledSystem
-        Its state is a particle, its noise one normal.
-    """
+    """The system of the particles, and what an observation does to them."""
 
     hybrid: Hybrid
-    system: CompiledSystem
+    system: CompiledSystem  # its state is a particle, its noise one normal
     linearization: Linearization
 
     @cached_property
