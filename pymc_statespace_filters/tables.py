@@ -29,21 +29,17 @@ def joined(parts: Iterable[str]) -> str:
 class SentenceTable(pd.DataFrame):
     """A DataFrame whose display has its main columns, and below them sentences.
 
-    Slices, results of operations and of ``table.copy()`` are plain DataFrames.
-
-    Parameters
-    ----------
-    data : pandas.DataFrame
-        With columns of ``main_columns``, and others.
-    sentences : sequence of str
-        What the display says below the columns.
+    ``_metadata`` names what it has beside them. Slices, results of operations and of
+    ``table.copy()`` are plain DataFrames.
     """
 
     main_columns: ClassVar[tuple[str, ...]]
     _metadata: ClassVar[list[str]] = ["sentences"]
 
-    def __init__(self, data: Any = None, *, sentences: Sequence[str] = ()) -> None:
+    def __init__(self, data: Any = None, *, sentences: Sequence[str] = (), **further: Any) -> None:
         super().__init__(data)
+        for name, value in further.items():
+            setattr(self, name, value)
         self.sentences = tuple(sentences)
 
     @property
@@ -52,7 +48,7 @@ class SentenceTable(pd.DataFrame):
 
     # Not `copy`, with which pandas begins operations that make the sentences wrong.
     def __copy__(self, deep: bool = False) -> Self:
-        return type(self)(self.copy(deep), sentences=self.sentences)
+        return type(self)(self.copy(deep), **{name: getattr(self, name) for name in self._metadata})
 
     def __deepcopy__(self, memo: dict[int, Any] | None = None) -> Self:
         return self.__copy__(deep=True)

@@ -1,7 +1,7 @@
 """The table of `identifiability`, with what it says in sentences."""
 
 from collections.abc import Iterator
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -39,24 +39,8 @@ class Identifiability(SentenceTable):
     _metadata: ClassVar[list[str]] = ["sentences", "directions", "combinations"]
     main_columns = ("ratio", "se", "q05", "q95", "coordinate", "prior_sd", "posterior_sd")
 
-    def __init__(
-        self,
-        data: Any = None,
-        *,
-        directions: pd.DataFrame,
-        combinations: pd.DataFrame,
-        **settings: Any,
-    ) -> None:
-        super().__init__(data, **settings)
-        self.directions, self.combinations = directions, combinations
-
-    def __copy__(self, deep: bool = False) -> Self:
-        return type(self)(
-            self.copy(deep),
-            directions=self.directions,
-            combinations=self.combinations,
-            sentences=self.sentences,
-        )
+    directions: pd.DataFrame
+    combinations: pd.DataFrame
 
     def _texts(self, name: str) -> list[str]:
         if name == "coordinate":

@@ -35,7 +35,7 @@ from ..pymc_model.elements import labels_of
 from ..pymc_model.posterior_draws import STEP_CHECK, STEP_NATS
 from ..pymc_model.step_refinement import densities_by_halvings, step_stability
 from ..statistics.lower_chains import lower_chains
-from .observed_data import scalar_count
+from .observed_data import observed_in, scalar_count
 from .posterior import Posterior
 
 MAX_RHAT = 1.05
@@ -130,7 +130,7 @@ def check_discretisation(model: pm.Model, idata: xr.DataTree, draws: Array) -> I
     except ModelError:
         return
     coarse, fine = (RowFunction(model, density).evaluate for density in densities)
-    limit = max(LOSS, LOSS_OF_A_SCALAR * scalar_count(model))
+    limit = max(LOSS, LOSS_OF_A_SCALAR * scalar_count(observed_in(model)))
     coarse_x, fine_beyond = coarse(x), fine(beyond)
     with np.errstate(invalid="ignore"):  # -inf minus -inf
         lost = coarse_x - fine(x)

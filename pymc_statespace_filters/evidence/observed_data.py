@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..pymc_model.aligned_axes import records_of_rows
 from ..pymc_model.inspection import scored_rows
+from ..pymc_model.prior import Support
 from ..pymc_model.random_variable import PanelRV
 
 
@@ -51,45 +52,32 @@ def _records(node: Any, values: NDArray[np.float64]) -> list[NDArray[np.float64]
     return np.split(values, np.flatnonzero(np.diff(records_of_rows(node.inputs[3]))) + 1)
 
 
-def observation_count(model: pm.Model) -> int:
-    """Count the observations J of a model that are scored and not entirely missing.
+def observation_count(observed: Sequence[Observed]) -> int:
+    """Count the observations J of some variables that are scored and not entirely missing.
 
     A vector-valued observation (a row of a state-space or multivariate variable) counts once, like
-    a scalar one; the counts of several observed variables are added.
+    a scalar one.
     """
-    return count_of(observed_in(model))
-
-
-def count_of(observed: Sequence[Observed]) -> int:
-    """Count the observations of some variables, as `observation_count`."""
     return sum(
         int((~np.isnan(one.scored).all(axis=-1) if one.is_vector else ~np.isnan(one.scored)).sum())
         for one in observed
     )
 
 
-def scalar_count(model: pm.Model) -> int:
-    """Count the observed scalars of a model that are scored and not missing."""
-    return sum(int((~np.isnan(one.scored)).sum()) for one in observed_in(model))
+def scalar_count(observed: Sequence[Observed]) -> int:
+    """Count the observed scalars that are scored and not missing."""
+    return sum(int((~np.isnan(one.scored)).sum()) for one in observed)
 
 
-def data_fingerprint(model: pm.Model) -> str:
-    """Hash the observed values of a model.
+def data_fingerprint(observed: Sequence[Observed]) -> str:
+    """Hash the observed values of some variables.
 
-    Returns
-    -------
-    str
-        Hexadecimal SHA-256 of shapes, values, positions of missing values and numbers of rows that
-        are not scored: reproducible across processes, and independent of the structure of the model
-        and the names of its variables. The records of a panel count like variables, so that neither
-        their order nor their labels matter. Axes of length one are ignored, so that a vector of J
-        values equals a table of one column.
+    It is a hexadecimal SHA-256 of shapes, values, positions of missing values and numbers of rows
+    that are not scored: reproducible across processes, and independent of the structure of the
+    model and the names of its variables. The records of a panel count like variables, so that
+    neither their order nor their labels matter. Axes of length one are ignored, so that a vector of
+    J values equals a table of one column.
     """
-    return fingerprint_of(observed_in(model))
-
-
-def fingerprint_of(observed: Sequence[Observed]) -> str:
-    """Hash the values of some variables, as `data_fingerprint`."""
     hashes = []
     for one in observed:
         unscored = f" scored from {one.score_from}" if one.score_from else ""
@@ -98,3 +86,14 @@ def fingerprint_of(observed: Sequence[Observed]) -> str:
             content = repr(values.shape).encode() + canonical.astype("<f8").tobytes()
             hashes.append(hashlib.sha256(content + unscored.encode()).digest())
     return hashlib.sha256(b"".join(sorted(hashes))).hexdigest()
+
+
+def facts_of(observed: Sequence[Observed], support: Support) -> dict[str, Any]:
+    """The fields of an `Evidence` that describe data and priors."""
+    return {
+        "n_observations": observation_count(observed),
+        "data_fingerprint": data_fingerprint(observed),
+        "log_volume": support.log_volume,
+        "uniform": support.uniform,
+        "improper": support.improper,
+    }

@@ -32,7 +32,7 @@ from .evidence import Evidence, store_evidence
 from .evidence_facts import CorrectingFilter, FiltersOfDraws, PartsOfPosterior
 from .exact_density import ExactDensity
 from .exchangeable_labels import OneOrder, undeclared_labels
-from .observed_data import data_fingerprint, observation_count
+from .observed_data import facts_of, observed_in
 from .posterior import Posterior
 from .posterior_of_draws import build_posterior
 from .reweighting.correction import exact_posterior
@@ -132,9 +132,12 @@ def run_estimators(
                 for name, one in estimates.items()
             }
 
-    of_model = _model_fields(model, posterior, support)
-    of_model |= {"max_log_likelihood": largest.log_likelihood, "noise": noise}
-    of_model["approximate"] = not (exactness(model) if exact is None else exact.is_exact)
+    of_model = facts_of(observed_in(model), support) | {
+        "n_parameters": posterior.draws.shape[-1],
+        "max_log_likelihood": largest.log_likelihood,
+        "noise": noise,
+        "approximate": not (exactness(model) if exact is None else exact.is_exact),
+    }
     found = {}
     for name, estimate in estimates.items():
         doubts = (*common, *estimate.doubts)
@@ -186,18 +189,6 @@ def _problem(estimator: Estimator, estimate: Estimate) -> tuple[str, Sequence[st
     above = "target_se" if target is None else f"target_se={target:g}"
     error = f"its standard error of {estimate.se:.2g} is above {above} ({estimate.shortfall})"
     return message, [*estimate.doubts, error]
-
-
-def _model_fields(model: pm.Model, posterior: Posterior, support: Support) -> dict[str, Any]:
-    """The fields of `Evidence` that describe model, data and priors."""
-    return {
-        "n_parameters": posterior.draws.shape[-1],
-        "n_observations": observation_count(model),
-        "data_fingerprint": data_fingerprint(model),
-        "log_volume": support.log_volume,
-        "uniform": support.uniform,
-        "improper": support.improper,
-    }
 
 
 def _check_guided(

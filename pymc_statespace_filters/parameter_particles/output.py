@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..checks.coverage.sentences import store as store_unvisited
 from ..errors import EvidenceWarning
 from ..evidence.evidence import Evidence, store_evidence
-from ..evidence.observed_data import Observed, count_of, fingerprint_of
+from ..evidence.observed_data import Observed, facts_of
 from ..filters.protocol import Filter
 from ..pymc_model.held_seed import INSIDE
 from ..pymc_model.inspection import exactness, filters_used, noise_seeds
@@ -142,15 +142,11 @@ def _evidence(
         *value_and_error,
         ESTIMATOR,
         n_parameters=run.cloud.others.particles.x.shape[1],
-        n_observations=count_of(observed),
         max_log_likelihood=maximum,
-        data_fingerprint=fingerprint_of(observed),
         noise="refreshed" if noise_seeds(model) else "none",
         doubts="; ".join(doubts),
-        log_volume=support.log_volume,
-        uniform=support.uniform,
-        improper=support.improper,
         approximate=not exactness(model),
+        **facts_of(observed, support),
     )
 
 

@@ -9,7 +9,7 @@ import pytensor.tensor as pt
 import pytest
 
 import pymc_statespace_filters as psf
-from pymc_statespace_filters.evidence.observed_data import data_fingerprint, observation_count
+from pymc_statespace_filters.evidence import observed_data
 
 RECORD = np.array([[0.1, 2.0], [np.nan, 1.0], [np.nan, np.nan], [0.4, -0.0]])
 
@@ -27,6 +27,14 @@ def scalar_model(values, sd=1.0):
         mu = pm.Normal("mu", 0, 1)
         pm.Normal("y", mu, sd, observed=pt.as_tensor(values))
     return model
+
+
+def observation_count(model):
+    return observed_data.observation_count(observed_data.observed_in(model))
+
+
+def data_fingerprint(model):
+    return observed_data.data_fingerprint(observed_data.observed_in(model))
 
 
 def test_rows_count_unless_wholly_missing():

@@ -9,7 +9,11 @@ import pytest
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.numerics.philox import seed_of_record
 from pymc_statespace_filters.errors import ModelError
-from pymc_statespace_filters.evidence.observed_data import observation_count, scalar_count
+from pymc_statespace_filters.evidence.observed_data import (
+    observation_count,
+    observed_in,
+    scalar_count,
+)
 from pymc_statespace_filters.pymc_model.step_refinement import densities_by_halvings
 from pymc_statespace_filters.system.panel_records import records_of
 from tests.systems import FORCE, FORCED, forced_terms
@@ -123,9 +127,10 @@ def test_the_first_rows_of_every_record_are_not_scored():
     expected = exact_terms()
     expected[[0, 3, 4]] = 0.0
     np.testing.assert_allclose(terms_of(model_of(score_from=1)), expected, rtol=1e-12)
-    assert observation_count(model_of()) == 5
+    assert observation_count(observed_in(model_of())) == 5
     # Without the first row of each record and the row that is missing.
-    assert observation_count(model_of(score_from=1)) == scalar_count(model_of(score_from=1)) == 2
+    later = observed_in(model_of(score_from=1))
+    assert observation_count(later) == scalar_count(later) == 2
     with pytest.raises(ModelError, match="score_from must be an integer from 0 to 2"):
         model_of(score_from=3)
 

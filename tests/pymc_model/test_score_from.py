@@ -10,6 +10,7 @@ from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.evidence.observed_data import (
     data_fingerprint,
     observation_count,
+    observed_in,
     scalar_count,
 )
 from tests.systems import FORCE, FORCED, FORCED_DATA, STEPS, forced_terms
@@ -114,9 +115,10 @@ def test_cross_validation_scores_the_later_rows():
 
 
 def test_the_evidence_counts_scored_rows_and_compares_equal_numbers_of_them():
-    everything, later = model_of(0), model_of(1)
+    models = model_of(0), model_of(1), model_of(2), model_of(1, psf.GridFilter())
+    everything, later, last, other = map(observed_in, models)
     assert (observation_count(everything), observation_count(later)) == (3, 2)
     assert (scalar_count(everything), scalar_count(later)) == (3, 2)
-    assert data_fingerprint(later) == data_fingerprint(model_of(1, psf.GridFilter()))
+    assert data_fingerprint(later) == data_fingerprint(other)
     assert data_fingerprint(later) != data_fingerprint(everything)
-    assert data_fingerprint(later) != data_fingerprint(model_of(2))
+    assert data_fingerprint(later) != data_fingerprint(last)

@@ -1,7 +1,7 @@
 """The table of `drift_scan`, with the times of the rows."""
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -74,12 +74,7 @@ class DriftScan(SentenceTable):
     _metadata: ClassVar[list[str]] = ["sentences", "paths"]
     main_columns = ("p_value", "p_alone", "statistic", "record", "time", "change")
 
-    def __init__(self, data: Any = None, *, paths: xr.Dataset, **settings: Any) -> None:
-        super().__init__(data, **settings)
-        self.paths = paths
-
-    def __copy__(self, deep: bool = False) -> Self:
-        return type(self)(self.copy(deep), paths=self.paths, sentences=self.sentences)
+    paths: xr.Dataset
 
     def _texts(self, name: str) -> list[str]:
         return [_text(name, value) for value in self[name]]

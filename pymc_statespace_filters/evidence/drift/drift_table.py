@@ -1,7 +1,7 @@
 """The table of `drift_evidence`."""
 
 from collections.abc import Iterator
-from typing import Any, ClassVar, Self
+from typing import ClassVar
 
 import pandas as pd
 import xarray as xr
@@ -26,13 +26,7 @@ class DriftTable(EvidenceTable):
         "log_bayes_factor",
         "se",
     )
-
-    def __init__(self, data: Any = None, *, widths: xr.Dataset, **settings: Any) -> None:
-        super().__init__(data, **settings)
-        self.widths = widths
-
-    def __copy__(self, deep: bool = False) -> Self:
-        return type(self)(self.copy(deep), widths=self.widths, sentences=self.sentences)
+    widths: xr.Dataset
 
 
 def sentences(table: pd.DataFrame, others: list[str], ci_prob: float) -> Iterator[str]:
