@@ -4,6 +4,9 @@ A wrong argument raises an exception before anything is computed. A failure insi
 value (minus infinity and a counted reason), reported by a warning afterwards.
 """
 
+import contextlib
+import functools
+import warnings
 from pathlib import Path
 
 __all__ = [
@@ -21,7 +24,13 @@ __all__ = [
     "StateSpaceFiltersError",
 ]
 
-INSIDE = (str(Path(__file__).parent),)  # files between a warning and the line of the user
+# Files between a warning and the line of the user: the package, and its decorators.
+INSIDE = (str(Path(__file__).parent), contextlib.__file__, functools.__file__)
+
+
+def warn(text: str, kind: type[Warning], *between: str) -> None:
+    """Warn at the line of the user, behind files with other prefixes where these are in between."""
+    warnings.warn(text, kind, skip_file_prefixes=(*INSIDE, *between))
 
 
 class StateSpaceFiltersError(Exception):

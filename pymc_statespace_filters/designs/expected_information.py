@@ -1,6 +1,5 @@
 """The public function: what a record of each design is expected to say, before it is measured."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,7 +8,7 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
-from ..errors import INSIDE, ModelError, ModelWarning
+from ..errors import ModelError, ModelWarning, warn
 from ..evidence.comparison.selection import prior_weights
 from ..parallel.cpu_affinity import cores_set_to
 from ..progress import stage_progress
@@ -239,10 +238,9 @@ def _warn_of_left_out(n_kept: Mapping[str, list[int]], n: int, models: list[str]
         for m, count in enumerate(counts)
     )
     if least < n:
-        warnings.warn(
+        warn(
             f"{n - least} of {n} records of the model {model!r} with the design {design!r} are "
             "left out, because they, or their likelihoods at the parameters that made them, are "
             "not finite: the numbers are about the others; narrow the priors",
             ModelWarning,
-            skip_file_prefixes=INSIDE,
         )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pymc.model.fgraph import fgraph_from_model, model_from_fgraph
 from scipy.special import logsumexp
 
-from ..errors import INSIDE, EvidenceWarning, ModelError
+from ..errors import EvidenceWarning, ModelError, warn
 from ..pymc_model.checked_model import checked_model
 from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.state_space_variable import StateSpaceVariable
@@ -218,7 +218,7 @@ def _score_by_reweighting(
     p_i = logsumexp(scored, axis=0) - np.log(len(scored)) - elpd_i
     if not known.all():
         message = _missing(known, good_k, first)
-        warnings.warn(message, EvidenceWarning, skip_file_prefixes=INSIDE)
+        warn(message, EvidenceWarning)
 
     def by_time(values: NDArray[np.float64]) -> xr.DataArray:
         time = terms.dims[-1]

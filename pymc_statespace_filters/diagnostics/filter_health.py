@@ -1,6 +1,5 @@
 """Filter diagnostics: one-step-ahead predictions compared with the observations."""
 
-import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,7 +8,7 @@ import xarray as xr
 
 from ..checks.filters.checks import stored
 from ..checks.filters.finding import OFF
-from ..errors import INSIDE, FilterWarning
+from ..errors import FilterWarning, warn
 from ..filters.outcomes import COLLAPSED
 from ..pymc_model.checked_model import checked_model
 from ..pymc_model.state_space_variable import StateSpaceVariable
@@ -193,7 +192,7 @@ def filter_diagnostics(
     n_used, n_all = (int(np.prod(one.shape)) for one in (draws, every))
     attrs = {"predictions": PREDICTION_NOTE, "draws": f"{n_used} of {n_all}"}
     for verdict in stored(idata, model, OFF) if filter is None else ():
-        warnings.warn(verdict, FilterWarning, skip_file_prefixes=INSIDE)
+        warn(verdict, FilterWarning)
     return add_group(idata, "filter_diagnostics", xr.merge(parts), attrs, extend_inferencedata)
 
 

@@ -1,6 +1,5 @@
 """Forward simulation of a system, in machine code."""
 
-import warnings
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -17,7 +16,7 @@ from ..compiler.native.entry_point import address_of, cached_on_disk, call_addre
 from ..compiler.native.jit import copy_into
 from ..compiler.native.python_call import call_in_thread, call_machine_code
 from ..compiler.numerics.philox import generators_of_records
-from ..errors import INSIDE, ModelError, ModelWarning
+from ..errors import ModelError, ModelWarning, warn
 from ..parallel.signals import held_interrupts
 from ..progress import slow_compilation
 from ..system.checks import check_flag, check_random_seed
@@ -350,11 +349,10 @@ def _warn_unless_finite(observations: np.ndarray, record: Record) -> None:
         place = f"at time {record.times([axis.steps for axis in record.axes])[row]}"
         if record.is_panel:
             place = f"of record {record.records.labels[record.records.of_rows()[row]]!r}"
-        warnings.warn(
+        warn(
             f"{failed.size} of {len(observations)} simulated observations are not finite, the "
             f"first in row {row}, {place}: the state overflows, or a covariance or a "
             "parameter of a distribution is invalid at these parameters. A filter takes NaN for a "
             "missing observation.",
             ModelWarning,
-            skip_file_prefixes=INSIDE,
         )

@@ -1,6 +1,5 @@
 """The public functions: one estimator, or several on the same draws and their agreement."""
 
-import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import is_dataclass, replace
 from html import escape
@@ -12,7 +11,7 @@ import pymc as pm
 import xarray as xr
 
 from ..compiler.native.compilation import COMPILATION
-from ..errors import INSIDE, EvidenceWarning, ModelError
+from ..errors import EvidenceWarning, ModelError, warn
 from ..filters.protocol import Filter
 from ..former_names import FORMER_ESTIMATORS
 from ..parallel.cpu_affinity import cores_set_to
@@ -319,10 +318,9 @@ def estimate_evidence(
         )
     found = EvidenceEstimates(estimates)
     if not found.agreement:
-        warnings.warn(
+        warn(
             f"the estimates of the log-evidence disagree: {found.agreement.diagnosis}",
             EvidenceWarning,
-            skip_file_prefixes=INSIDE,
         )
     return found
 

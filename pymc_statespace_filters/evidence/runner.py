@@ -2,7 +2,6 @@
 
 import math
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -13,7 +12,7 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
-from ..errors import INSIDE, EvidenceWarning, ModelError
+from ..errors import EvidenceWarning, ModelError, warn
 from ..facts import sentences
 from ..filters.protocol import Filter
 from ..filters.written import short_form
@@ -229,6 +228,4 @@ def _estimates(
 
 def _warn(message: str, reasons: Sequence[str]) -> None:
     if reasons:
-        warnings.warn(
-            f"{message}: {'; '.join(reasons)}", EvidenceWarning, skip_file_prefixes=INSIDE
-        )
+        warn(f"{message}: {'; '.join(reasons)}", EvidenceWarning)

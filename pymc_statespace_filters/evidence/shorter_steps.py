@@ -1,6 +1,5 @@
 """What a shorter integration step would change: the log-likelihood and the log-evidence."""
 
-import warnings
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from typing import NamedTuple
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 from scipy.special import logsumexp, softmax
 
-from ..errors import EvidenceWarning
+from ..errors import EvidenceWarning, warn
 from ..progress import row_progress
 from ..pymc_model.checked_model import checked_model
 from ..pymc_model.density import RowFunction, check_free_variables
@@ -149,7 +148,7 @@ def step_error(
     dt = pd.Index(max(step_lengths(model)) * 0.5 ** np.arange(1, halvings + 1), name="dt")
     changes = [_change(coarse, fine, population) for fine in finer]
     for text in (*_zeros(coarse, finer), *chain.from_iterable(map(_doubts, dt, changes))):
-        warnings.warn(text, EvidenceWarning, stacklevel=2)
+        warn(text, EvidenceWarning)
     return pd.DataFrame([one[: len(COLUMNS)] for one in changes], dt, COLUMNS)
 
 

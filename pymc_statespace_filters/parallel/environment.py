@@ -1,14 +1,13 @@
 """Versions and processor of this process, on which the last bits of a result depend."""
 
 import platform
-import warnings
 from functools import cache
 from importlib.metadata import version
 from zlib import crc32
 
 from numba.core.registry import cpu_target
 
-from ..errors import ParallelError, ParallelWarning
+from ..errors import ParallelError, ParallelWarning, warn
 
 _PACKAGES = ("pymc-statespace-filters", "pymc", "pytensor", "numba", "llvmlite", "numpy", "scipy")
 _PROCESSOR = "processor"
@@ -57,11 +56,10 @@ def check_environments(reports: list[dict[str, str]], rank: int, *, in_lockstep:
             f"ranks that evaluate one likelihood must have the same environment, got {found}"
         )
     if rank == 0:
-        warnings.warn(
+        warn(
             f"The ranks differ: {found} The draws of a chain then depend on the rank that runs it: "
             "they are correct, but not bitwise reproducible.",
             ParallelWarning,
-            stacklevel=2,
         )
 
 

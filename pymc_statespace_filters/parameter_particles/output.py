@@ -5,7 +5,6 @@ evidence and kept in their order, so that a chain of the result is nearly a popu
 takes draws of a posterior takes these.
 """
 
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
@@ -14,11 +13,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ..checks.coverage.sentences import store as store_unvisited
-from ..errors import EvidenceWarning
+from ..errors import EvidenceWarning, warn
 from ..evidence.evidence import Evidence, store_evidence
 from ..evidence.observed_data import Observed, facts_of
 from ..filters.protocol import Filter
-from ..pymc_model.held_seed import INSIDE
+from ..pymc_model.held_seed import BETWEEN
 from ..pymc_model.inspection import exactness, filters_used, noise_seeds
 from ..pymc_model.posterior_draws import BY_PARTICLES, COURSE
 from ..pymc_model.prior import Support
@@ -94,11 +93,11 @@ def as_datatree(
     support = Support.of(model)
     doubts = [*support.check(), *_doubts(run)]
     if doubts:
-        warnings.warn(
+        warn(
             f"the log-evidence {merged:.2f} is less certain than its standard error suggests: "
             f"{'; '.join(doubts)}",
             EvidenceWarning,
-            skip_file_prefixes=INSIDE,
+            *BETWEEN,
         )
     doubts += doubts_of(tree, filter, seconds)
     evidence = _evidence(model, support, (merged, error), run, observed, maximum, doubts)

@@ -1,6 +1,5 @@
 """Percentiles of the data in bins of time, pooled over records, beside those of replicates."""
 
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,7 +8,7 @@ import pymc as pm
 import xarray as xr
 from arviz_plots import PlotCollection
 
-from ..errors import INSIDE, ModelError, ModelWarning
+from ..errors import ModelError, ModelWarning, warn
 from ..system.checks import check_count, is_integer, shortened
 from .over_time import DATA, DRAWS, OPACITIES, over_draws, picture_over_time, points_of
 from .picture import Mark
@@ -203,13 +202,12 @@ def _warn_of_same_records(
         own = [one for one in own if one in [variable.name for variable in model.free_RVs]]
     kept = [one for one in own if one not in drawn or _agree(posterior[one], drawn[one])]
     if kept and (model is not None or kept == own):
-        warnings.warn(
+        warn(
             f"{kept} differ between records, and posterior_predictive has no new draws of them: "
             "its data are of the same records, and show nothing of the population. Call "
             f"pm.sample_posterior_predictive(idata, sample_vars={[*own, name]}, "
             "extend_inferencedata=True)",
             ModelWarning,
-            skip_file_prefixes=INSIDE,
         )
 
 

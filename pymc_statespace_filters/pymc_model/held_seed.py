@@ -5,17 +5,14 @@ for it, so the call stack is read: the first function outside PyMC's own graphs 
 `sample_dram` ask from this package, and so do functions that evaluate or predict.
 """
 
-import functools
 import sys
-import warnings
 from pathlib import Path
 from types import FrameType
 
 import pymc
 import pytensor
 
-from ..errors import INSIDE as PACKAGE
-from ..errors import FilterWarning
+from ..errors import FilterWarning, warn
 from ..filters.protocol import Filter
 from ..filters.written import short_form
 
@@ -23,25 +20,21 @@ _SAMPLERS = ("pymc.step_methods.", "pymc.smc.")
 # Those with gradients, of which there are none: an error says so.
 WITH_GRADIENT = ("pymc.step_methods.hmc.", "pymc.step_methods.arraystep.")
 _GRAPHS = ("pymc.logprob.", "pymc.model.", "pytensor.", "functools", f"{__package__}.")
-# Files between a warning and the line of the user.
-INSIDE = (
-    *PACKAGE,
-    *(str(Path(module.__file__).parent) for module in (pymc, pytensor)),
-    functools.__file__.removesuffix(".py"),
-)
+# Files between the package and the line of the user.
+BETWEEN = tuple(str(Path(module.__file__).parent) for module in (pymc, pytensor))
 
 
 def warn_of_held_seed(filter: Filter) -> None:
     """Warn if a sampler of PyMC asks for the log-density of a filter with noise."""
     who = asks_from() if filter.noisy else ""
     if who.startswith(_SAMPLERS) and not who.startswith(WITH_GRADIENT):
-        warnings.warn(
+        warn(
             f"{short_form(filter)}: this sampler evaluates the estimated likelihood with one noise "
             "seed throughout. If it moves parameters of the likelihood, its draws are those of the "
             "posterior under that seed, with the error of the estimate. Use psf.sample_dram() or "
             "pm.sample(step=psf.DRAM()), which draw new noise for each proposal.",
             FilterWarning,
-            skip_file_prefixes=INSIDE,
+            *BETWEEN,
         )
 
 

@@ -3,23 +3,21 @@
 ArviZ takes stored terms for those of leave-one-out cross-validation, and cannot know better.
 """
 
-import warnings
-
-from ..errors import EvidenceWarning
-from .held_seed import INSIDE, asks_from
+from ..errors import EvidenceWarning, warn
+from .held_seed import BETWEEN, asks_from
 
 _STORES_TERMS = "pymc.stats.log_density."  # pm.compute_log_likelihood, also within pm.sample
 
 
 def warn_of_sequence(whose: str, instead: str = "") -> None:
     """Warn that terms are sequential; ``instead`` is what else to do."""
-    warnings.warn(
+    warn(
         f"the terms of {whose} are conditional on the earlier observations: az.loo and az.compare "
         "of them are no leave-one-out cross-validation. Compare scores "
         "psf.leave_future_out(idata, model, min_observations=..., refit=lambda model: "
         f"psf.sample_dram(model=model)){instead}",
         EvidenceWarning,
-        skip_file_prefixes=INSIDE,
+        *BETWEEN,
     )
 
 

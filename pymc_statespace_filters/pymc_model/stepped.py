@@ -5,7 +5,6 @@ way from the free variables to an observed one. Between two steps the likelihood
 that its gradient says nothing of the variable.
 """
 
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -22,9 +21,9 @@ from pytensor.tensor.elemwise import Elemwise
 from pytensor.tensor.shape import SpecifyShape
 
 from ..compiler.lowering.compiled_system import compile_system
-from ..errors import FilterWarning
+from ..errors import FilterWarning, warn
 from ..system.model import StateSpaceModel
-from .held_seed import INSIDE, WITH_GRADIENT, asks_from
+from .held_seed import BETWEEN, WITH_GRADIENT, asks_from
 from .inspection import state_space_nodes
 
 _COMPARED = (
@@ -81,13 +80,13 @@ def warn_of_steps(system: StateSpaceModel, theta: Variable) -> None:
     if not asks_from().startswith((*WITH_GRADIENT, "nutpie.")):
         return
     if names := [n for n in compile_system(system).stepped_parameters if _varies(n, system, theta)]:
-        warnings.warn(
+        warn(
             f"the likelihood is a staircase of {', '.join(names)}, which a condition of the "
             "equations compares with times or inputs: its gradient says nothing of the steps, and "
             "NUTS does not find its way. Use psf.sample_dram(), or a smooth transition such as "
             "pt.sigmoid((t - tau) / width)",
             FilterWarning,
-            skip_file_prefixes=INSIDE,
+            *BETWEEN,
         )
 
 

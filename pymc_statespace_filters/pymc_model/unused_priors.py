@@ -1,7 +1,6 @@
 """Warnings of priors that reach no data: a name is misspelt, or all data are missing."""
 
 import difflib
-import warnings
 from collections.abc import Iterator
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -11,9 +10,9 @@ import pymc as pm
 from pytensor.graph.basic import Constant
 from pytensor.graph.traversal import ancestors
 
-from ..errors import ModelWarning
+from ..errors import ModelWarning, warn
 from ..system.equations import RESERVED
-from .held_seed import INSIDE
+from .held_seed import BETWEEN
 from .inspection import parameter_graphs, state_space_nodes
 
 # Of the similarity of two names from 0 to 1: "beta" and "b" have 0.4.
@@ -33,22 +32,22 @@ def warn_of_unused_priors(model: pm.Model) -> None:
         if name in told:
             continue
         told.add(name)
-        warnings.warn(
+        warn(
             f"the prior of {name!r} reaches no likelihood, so its posterior is the prior"
             + _probable_cause(name, fixed),
             ModelWarning,
-            skip_file_prefixes=INSIDE,
+            *BETWEEN,
         )
 
 
 def warn_of_no_data(name: str, observed: Any) -> None:
     """Warn if data that cannot be set later have no number."""
     if isinstance(observed, Constant) and np.isnan(observed.data).all():
-        warnings.warn(
+        warn(
             f"observed of {name!r} has no number, all of its {len(observed.data)} rows are missing "
             "(NaN), so that the posterior is the prior",
             ModelWarning,
-            skip_file_prefixes=INSIDE,
+            *BETWEEN,
         )
 
 

@@ -1,7 +1,6 @@
 """Fields of states, which are sums of terms with coefficients, at draws of the coefficients."""
 
 import math
-import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -10,7 +9,7 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from ..errors import INSIDE, ModelError, ModelWarning
+from ..errors import ModelError, ModelWarning, warn
 from ..pymc_model.other_filter import model_of_draws
 from ..pymc_model.posterior_draws import posterior_group
 from ..system.checks import check_ci_prob, check_count, check_floats, check_random_seed
@@ -185,7 +184,7 @@ def field(
             )
         ]
         for doubt in doubts:
-            warnings.warn(doubt, ModelWarning, skip_file_prefixes=INSIDE)
+            warn(doubt, ModelWarning)
         found[name] = data.assign_attrs(ci_prob=ci_prob, doubts="; ".join(doubts))
     return xr.DataTree.from_dict(found)
 

@@ -12,7 +12,7 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
-from ..errors import INSIDE, FilterWarning, ModelError
+from ..errors import FilterWarning, ModelError, warn
 from ..evaluation.simulate import simulator
 from ..parallel.cpu_affinity import available_cores
 from ..parallel.threads import run_in_threads
@@ -350,12 +350,11 @@ def _warn_of_failed_runs(name: str, paths: Sequence[Array]) -> None:
     failed = np.concatenate([np.isnan(path).any(axis=(1, 2)) for path in paths])
     if failed.any():
         runs = "draws" if len(paths) == 1 else "draws and records"
-        warnings.warn(
+        warn(
             f"the free run of {name!r} leaves the finite numbers at {failed.sum()} of "
             f"{failed.size} {runs}, where the model is unstable: their predictions are NaN, and no "
             "error or coverage counts them",
             FilterWarning,
-            skip_file_prefixes=INSIDE,
         )
 
 

@@ -17,7 +17,6 @@ So filters, simulations and forecasts treat lengths, times and the rest as they 
 Here the user's are checked, and these columns are made, read and hidden from the user.
 """
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -27,7 +26,7 @@ from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Constant, Variable
 from pytensor.tensor.variable import TensorVariable
 
-from ..errors import INSIDE, ModelError, ModelWarning
+from ..errors import ModelError, ModelWarning, warn
 from .checks import shortened
 from .labels import table_of
 from .panel_records import FIRST_INPUT, RECORD, STEP
@@ -276,13 +275,12 @@ def warn_of_gaps_in_sums(system: "StateSpaceModel", observed: np.ndarray) -> Non
     n_rows, missing = len(unseen), unseen.sum(axis=0).astype(int)
     for name, n_missing in zip(system.accumulators, missing.tolist(), strict=True):
         if 0 < n_missing < n_rows / 2:  # a sum of several rows is missing in most
-            warnings.warn(
+            warn(
                 f"{n_missing} of {n_rows} rows have no value of {name!r}, which sums on to the next"
                 " value: if a value counts since the row before it, as weekly cases do, give "
                 "StateSpaceModel(resets='row'); if it counts since the last value, give "
                 "resets='seen', which ends this warning",
                 ModelWarning,
-                skip_file_prefixes=INSIDE,
             )
 
 

@@ -1,12 +1,11 @@
 """A warning of numbers in data that probably stand for a missing value, such as -999."""
 
-import warnings
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import INSIDE, ModelWarning
+from ..errors import ModelWarning, warn
 
 if TYPE_CHECKING:
     from .model import StateSpaceModel
@@ -25,12 +24,11 @@ def warn_of_missing_codes(system: "StateSpaceModel", observed: NDArray[np.float6
     """Warn of a number in the data (J, p) that lies far from all others."""
     for name, column in zip(system.observables, observed.T, strict=True):
         if (far := _far_number(column)) is not None:
-            warnings.warn(
+            warn(
                 f"observed has {name} = {far:g} in {_rows(np.flatnonzero(column == far))}, more "
                 f"than {_factor(far):g} times the range of all other numbers away from them. If it "
                 "stands for a missing value, put NaN there",
                 ModelWarning,
-                skip_file_prefixes=INSIDE,
             )
 
 

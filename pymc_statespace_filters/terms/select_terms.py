@@ -1,6 +1,5 @@
 """The public function: which terms belong in the equation."""
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -10,7 +9,7 @@ import pymc as pm
 import xarray as xr
 
 from ..compiler.native.compilation import COMPILATION
-from ..errors import INSIDE, EvidenceWarning
+from ..errors import EvidenceWarning, warn
 from ..parallel.shared_rows import by_first_rank
 from ..progress import row_progress
 from ..pymc_model.in_step import shared_by_ranks
@@ -222,7 +221,5 @@ def select_terms(
         *doubts(found, points, candidates, visits, full if maxima is None else None),
     ]
     for doubt in reasons:
-        warnings.warn(
-            f"probabilities of terms: {doubt}", EvidenceWarning, skip_file_prefixes=INSIDE
-        )
+        warn(f"probabilities of terms: {doubt}", EvidenceWarning)
     return tree

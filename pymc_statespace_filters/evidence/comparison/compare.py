@@ -1,7 +1,6 @@
 """Model probabilities from evidences (thesis, 3.1.2)."""
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, overload
 
@@ -11,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from ...errors import EvidenceWarning, ModelError
+from ...errors import EvidenceWarning, ModelError, warn
 from ...former_names import former_names
 from ...system.checks import check_ci_prob
 from ..evidence import Evidence
@@ -231,11 +230,10 @@ def _approximate(models: Sequence[Evidence]) -> pd.api.extensions.ExtensionArray
 def _warn_of_improper(found: Mapping[str, Evidence]) -> None:
     improper = [f"{name!r} ({one.improper})" for name, one in found.items() if one.improper]
     if improper:
-        warnings.warn(
+        warn(
             f"improper or unnormalised priors in {', '.join(improper)}: the model probabilities "
             "depend on the units of these parameters; give them proper priors",
             EvidenceWarning,
-            stacklevel=4,
         )
 
 

@@ -1,6 +1,5 @@
 """Sensitivity of model probabilities to the width of the priors."""
 
-import warnings
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
@@ -10,7 +9,7 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from ...errors import EvidenceWarning, ModelError
+from ...errors import EvidenceWarning, ModelError, warn
 from ...pymc_model.posterior_draws import check_one_model, unconstrained_draws
 from ...system.checks import check_ci_prob
 from .compare import compare_evidence
@@ -114,7 +113,7 @@ def prior_sensitivity(
     idatas, priors = _draws_and_priors(evidences, models, var_names)
     found = _width_curves(idatas, priors, factors.tolist(), may_leave_out=not var_names)
     if found.left_out:
-        warnings.warn(found.note, EvidenceWarning, stacklevel=3)
+        warn(found.note, EvidenceWarning)
     log_evidence, se, prior = (table[name].to_numpy() for name in ("log_evidence", "se", "prior"))
     return dataset_of_curves(
         curves_of_models(log_evidence, se, np.log(prior), list(found.points.values()), ci_prob),

@@ -1,6 +1,5 @@
 """The public function: whether a parameter drifts, as a Bayes factor."""
 
-import warnings
 from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.stats import norm
 
 from ...compiler.native.compilation import COMPILATION
-from ...errors import EvidenceWarning
+from ...errors import EvidenceWarning, warn
 from ...progress import row_progress
 from ...pymc_model.density import ModelDensity
 from ...pymc_model.inspection import given_model
@@ -176,9 +175,9 @@ def drift_evidence(
     table = _table(log_terms, means, doubts, prior, ci_prob)
     for name, row in table.iterrows():
         if row["doubts"]:
-            warnings.warn(f"drift of {name}: {row['doubts']}", EvidenceWarning, stacklevel=2)
+            warn(f"drift of {name}: {row['doubts']}", EvidenceWarning)
     if of_chains:
-        warnings.warn(f"drift: {'; '.join(of_chains)}", EvidenceWarning, stacklevel=2)
+        warn(f"drift: {'; '.join(of_chains)}", EvidenceWarning)
     known = {one: None if doubts[one] else terms for one, terms in log_terms.items()}
     curves = _by_width(model, idata, known, factors, np.log(prior), ci_prob)
     others = [rv.name for rv in model.free_RVs if rv.name not in names]

@@ -2,7 +2,6 @@
 
 import json
 import time
-import warnings
 from collections.abc import Iterator
 from typing import Any
 
@@ -11,7 +10,7 @@ import pymc as pm
 import xarray as xr
 
 from ...compiler.native.compilation import COMPILATION
-from ...errors import INSIDE, EvidenceWarning, FilterWarning, ModelError
+from ...errors import EvidenceWarning, FilterWarning, ModelError, warn
 from ...facts import in_words
 from ...filters.protocol import Filter
 from ...filters.written import short_form
@@ -184,10 +183,10 @@ def reweight(
         tree.attrs |= (attrs := _attributes(found, exact))
         off = in_words(CorrectingFilter(tree, model, filter, seconds, own))
     if off:  # by which the weights are as they are
-        warnings.warn(off, FilterWarning, skip_file_prefixes=INSIDE)
+        warn(off, FilterWarning)
         return tree
     for problem in _problems(attrs, filter):
-        warnings.warn(problem, EvidenceWarning, skip_file_prefixes=INSIDE)
+        warn(problem, EvidenceWarning)
     return tree
 
 

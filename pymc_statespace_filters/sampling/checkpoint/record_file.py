@@ -11,7 +11,6 @@ key, under another name until it is whole.
 
 import os
 import struct
-import warnings
 import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -19,7 +18,7 @@ from pathlib import Path
 from threading import RLock
 from typing import BinaryIO, NamedTuple
 
-from ...errors import CheckpointError, CheckpointWarning
+from ...errors import CheckpointError, CheckpointWarning, warn
 from .arrays import Arrays, Stored, decoded, encoded, joined
 
 _FORMAT, _VERSION = b"pymc_statespace_filters checkpoint ", b"3\n"
@@ -166,11 +165,10 @@ class RecordFile:
             file.truncate(index.size)
         if is_cut:
             n = index.n_records
-            warnings.warn(
+            warn(
                 f"{self.path}: record {n + 1} is torn or damaged. It and all later ones are "
                 f"removed; the run {f'resumes after record {n}' if n else 'begins anew'}",
                 CheckpointWarning,
-                stacklevel=4,
             )
         return index
 

@@ -1,13 +1,12 @@
 """A panel from the table of pharmacometrics: rows of data, events, inputs and covariates."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from ...errors import INSIDE, ModelError, ModelWarning
+from ...errors import ModelError, ModelWarning, warn
 from ..checks import check_finite
 from .doses import doses_of, events_of, inputs_of
 from .table import ClinicalTable, named, read_table
@@ -119,11 +118,10 @@ def read_events(
     varying = _columns(table, "changing", changing)
     used = {*table.given.values(), *constant, *varying}
     if unused := [name for name in frame.columns if name not in used]:
-        warnings.warn(
+        warn(
             f"columns of frame that are not used: {unused}; list them in covariates= or changing=, "
             "or drop them, frame.drop(columns=[...])",
             ModelWarning,
-            skip_file_prefixes=INSIDE,
         )
     arguments = _data(table, observables)
     doses = doses_of(table, compartments, ss_doses)
