@@ -5,6 +5,7 @@ import pymc as pm
 from numpy.typing import NDArray
 
 from ..pymc_model.at_points import GraphsAtPoints
+from ..pymc_model.inspection import log_density_graph
 from ..statistics.importance import largest_good_k, normalised, smoothed, systematic
 from ..statistics.student_mixture import StudentMixture, mixture_of
 from .fisher_information import Coordinates, Likelihood, spread
@@ -33,7 +34,9 @@ class FullPosterior:
         start = model.initial_point()
         values = [model.rvs_to_values[rv] for rv in model.free_RVs]
         point = {value: start[value.name] for value in values}
-        self._log_density_of_x = GraphsAtPoints(model, [model.logp(vars=model.free_RVs)], point)
+        self._log_density_of_x = GraphsAtPoints(
+            model, [log_density_graph(model, model.free_RVs)], point
+        )
 
     def spread(self, x: Array, cov: Array, rng: np.random.Generator) -> Array | None:
         """Of the posterior of a record simulated at x (k,), by `spread` in the coordinates, (k,).

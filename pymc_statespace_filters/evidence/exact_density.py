@@ -13,7 +13,7 @@ from ..filters.protocol import Filter
 from ..filters.written import short_form
 from ..pymc_model.density import RowFunction, check_free_variables
 from ..pymc_model.filter_estimates import VariableAtPoints
-from ..pymc_model.inspection import state_space_nodes
+from ..pymc_model.inspection import log_density_graph, state_space_nodes
 
 BLOCK = 64  # points between two reports of progress
 
@@ -49,7 +49,7 @@ class ExactDensity:
         self.on_progress: Callable[[int], None] = lambda count: None
         variables = [*model.basic_RVs, *model.potentials]
         others = [variable for variable in variables if variable.name not in nodes]
-        self._others = RowFunction(model, model.logp(vars=others))
+        self._others = RowFunction(model, log_density_graph(model, others))
         self._variables: list[VariableAtPoints] = []
 
     def evaluate(self, x: Array, seeds: Seeds) -> Array:

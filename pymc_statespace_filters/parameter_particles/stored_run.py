@@ -20,6 +20,7 @@ from pytensor.graph.traversal import graph_inputs
 from ..errors import DataMismatchError, ModelError
 from ..filters.written import filter_from
 from ..pymc_model.filter_rows import Record
+from ..pymc_model.inspection import log_density_graph
 from ..pymc_model.other_filter import model_with
 from ..pymc_model.posterior_draws import COURSE
 from ..smc.bridge import Cloud
@@ -157,7 +158,10 @@ def _identity(rows: ObservedRows) -> str:
     """A text that is the same for models that differ in their record alone."""
     model, variable = rows.model, rows.variable
     free = [model.rvs_to_values[rv] for rv in model.free_RVs]
-    graphs = [model.logp(vars=model.free_RVs), *model.replace_rvs_by_values([variable.theta])]
+    graphs = [
+        log_density_graph(model, model.free_RVs),
+        *model.replace_rvs_by_values([variable.theta]),
+    ]
     known = {value: digest("value of", str(value.name)) for value in free}
     for own in graph_inputs(graphs):
         if isinstance(own, SharedVariable):

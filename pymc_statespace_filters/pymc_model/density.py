@@ -23,7 +23,7 @@ from ..compiler.native.compilation import COMPILATION, undamaged_files, warning_
 from ..compiler.native.rows import Rows
 from ..errors import ModelError
 from .graph_rewrites import smooth_filters, with_filter
-from .inspection import check_observed, noise_seeds
+from .inspection import check_observed, log_density_graph, noise_seeds
 from .written_function import native_function
 
 Array = NDArray[np.float64]
@@ -143,10 +143,10 @@ class ModelDensity(RowFunction):
         check_free_variables(model)
         self.model = model
         self.moved = moved
-        log_density = model.logp()
+        graph = log_density_graph(model)
         if moved:
-            (log_density,) = with_filter([log_density], model, smooth_filters(model))
-        super().__init__(model, log_density)
+            (graph,) = with_filter([graph], model, smooth_filters(model))
+        super().__init__(model, graph)
 
 
 class ConstrainedDensity(RowFunction):
@@ -165,5 +165,5 @@ class ConstrainedDensity(RowFunction):
         terms += replace_rvs_by_values(model.potentials, **settings)
         by_name = {value.name: value for value in free.values()}
         example = {by_name[name]: at for name, at in point.items()}
-        log_density: Any = sum(term.sum() for term in terms)
-        super().__init__(model, log_density, point=example)
+        total: Any = sum(term.sum() for term in terms)
+        super().__init__(model, total, point=example)

@@ -11,6 +11,7 @@ from pytensor.graph.traversal import graph_inputs
 from pytensor.tensor.random.type import RandomType
 
 from ..system.graph_digest import described, digest, graph_digest
+from .inspection import log_density_graph
 
 FINGERPRINT_DIGITS = 16  # 64 bits, in a checkpoint and in messages
 
@@ -79,4 +80,4 @@ def _roots(model: pm.Model) -> dict[Variable, Variable]:
 
 
 def _outputs(model: pm.Model) -> list[Variable]:
-    return [model.logp(), *model.unobserved_value_vars]
+    return [log_density_graph(model), *model.unobserved_value_vars]

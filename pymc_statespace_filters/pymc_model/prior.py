@@ -19,6 +19,7 @@ from pytensor.tensor.variable import TensorVariable
 from ..errors import GradientUnavailableError, ModelError
 from .density import RowFunction, check_free_variables
 from .elements import places_in_vector
+from .inspection import log_density_graph
 from .prior_draws import PriorDraws
 
 _IMPROPER = (FlatRV, HalfFlatRV, ICARRV)  # PyMC's densities without a finite integral
@@ -186,7 +187,7 @@ class ModelPrior:
 
     @cached_property
     def _density(self) -> RowFunction:
-        density = RowFunction(self._model, self._model.logp(vars=self._free))
+        density = RowFunction(self._model, log_density_graph(self._model, self._free))
         density.calls.is_shared = False
         return density
 
@@ -206,7 +207,7 @@ class ModelFactors:
     def __init__(self, model: pm.Model) -> None:
         check_free_variables(model)
         self.prior, self._model = ModelPrior(model), model
-        self._graph = model.logp(vars=[*model.observed_RVs, *model.potentials])
+        self._graph = log_density_graph(model, [*model.observed_RVs, *model.potentials])
         self.likelihood = RowFunction(model, self._graph)
 
     @property

@@ -20,7 +20,7 @@ from ..system.integrators.substeps import CoupledNoise
 from ..system.model import StateSpaceModel
 from ..system.panel_records import FIRST_INPUT, RECORD, STEP
 from .at_points import GraphsAtPoints
-from .inspection import likelihood_nodes
+from .inspection import likelihood_nodes, log_density_graph
 
 MAX_STEPS = 500
 STEPS_PER_JACOBIAN = 10
@@ -36,8 +36,8 @@ def densities_by_halvings(model: pm.Model, halvings: int) -> list[TensorVariable
     has the same mean, and all lengths of the step are driven by the same path of the noise, so that
     their estimates with one seed differ little.
     """
-    log_density = model.logp()
-    nodes = likelihood_nodes([log_density])
+    density = log_density_graph(model)
+    nodes = likelihood_nodes([density])
     if not any(node.op.system.integrator for node in nodes):
         raise ModelError(
             "model must have a StateSpace variable whose system has an integrator, such as "
@@ -50,12 +50,12 @@ def densities_by_halvings(model: pm.Model, halvings: int) -> list[TensorVariable
         if node.op.system.integrator is not None:
             for into, outputs in zip(replaced, _halved(node, halvings), strict=True):
                 into |= dict(zip(node.outputs, outputs, strict=True))
-    return [clone_replace(log_density, into) for into in replaced]
+    return [clone_replace(density, into) for into in replaced]
 
 
 def step_lengths(model: pm.Model) -> list[float]:
     """The length of the substeps of every integrator of a model."""
-    systems = [node.op.system for node in likelihood_nodes([model.logp()])]
+    systems = [node.op.system for node in likelihood_nodes([log_density_graph(model)])]
     return [s.integrator.substep().dt for s in systems if s.integrator is not None]
 
 
@@ -151,7 +151,11 @@ def _along_paths(
 
     Of systems whose steps have an error; those of `ExactLinear` would be thousands of exponentials.
     """
-    nodes = [n for n in likelihood_nodes([model.logp()]) if _has_error(n.op.system.integrator)]
+    nodes = [
+        n
+        for n in likelihood_nodes([log_density_graph(model)])
+        if _has_error(n.op.system.integrator)
+    ]
     if not nodes:
         return None
     # theta, steps, inputs and t0, but not data and seed.

@@ -26,7 +26,7 @@ from ..system.panel_records import FIRST_INPUT, RECORD, STEP, records_of, rows_o
 from ..system.parameters import element_names
 from .at_points import GraphsAtPoints
 from .density import RowFunction, check_free_variables
-from .inspection import scored_rows, state_space_nodes
+from .inspection import log_density_graph, scored_rows, state_space_nodes
 from .random_variable import draw_in_python
 
 STEP_OF_X = 1e-5  # of the unconstrained parameters, whose unit is about one
@@ -81,7 +81,7 @@ class ScoredVariable:
     def _others(self) -> RowFunction:
         model = self._model
         others = [v for v in [*model.basic_RVs, *model.potentials] if v.name != self.name]
-        return RowFunction(model, model.logp(vars=others))
+        return RowFunction(model, log_density_graph(model, others))
 
     @property
     def n_records(self) -> int:

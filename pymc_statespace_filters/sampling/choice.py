@@ -7,7 +7,7 @@ import pytensor
 from pymc.model import Model
 from pytensor.gradient import DisconnectedInputError
 
-from ..pymc_model.inspection import gradient_obstacle, kinked_variable
+from ..pymc_model.inspection import gradient_obstacle, kinked_variable, log_density_graph
 from ..pymc_model.stepped import stepped_variables
 
 DRAM, NUTS, BOTH = "dram", "nuts", "both"
@@ -51,7 +51,7 @@ def why_no_nuts(model: Model) -> str:
 
 def _missing_gradient(model: Model) -> str:
     try:
-        pytensor.grad(model.logp(), [model.rvs_to_values[rv] for rv in model.free_RVs])
+        pytensor.grad(log_density_graph(model), [model.rvs_to_values[rv] for rv in model.free_RVs])
     except DisconnectedInputError:
         return "the density has no gradient with respect to some parameter"
     except (NotImplementedError, TypeError, ValueError):

@@ -13,6 +13,8 @@ from pymc_statespace_filters.ops.likelihood import LogLikelihood
 from pymc_statespace_filters.pymc_model.graph_rewrites import with_filter
 from pymc_statespace_filters.pymc_model.inspection import (
     health_outputs,
+    log_density_graph,
+    log_density_terms,
     noise_seeds,
     noisy_filters,
     resized,
@@ -160,3 +162,19 @@ def test_draws_and_model_in_the_wrong_order(function, settings):
 def test_a_number_in_place_of_the_model_is_told_how_to_be_given():
     with pytest.raises(ModelError, match=r"got int 10: give a number by name, such as n_steps=10"):
         psf.forecast(xr.DataTree(), 10)
+
+
+def test_a_model_that_has_changed_has_other_terms():
+    """They are derived once, until a variable is added or a transform exchanged."""
+    with pm.Model() as model:
+        a, b = pm.HalfNormal("a"), pm.Normal("b")
+    first, again = (dict(log_density_terms(model)) for _ in range(2))
+    assert first == again
+    model.rvs_to_transforms[a] = None
+    with model:
+        c = pm.Potential("c", -(b**2))
+    for variables in (None, [c, a]):
+        mine, own = log_density_graph(model, variables), model.logp(variables)
+        at = {model.rvs_to_values[a]: 2.0, model.rvs_to_values[b]: 3.0}
+        found, expected = (graph.eval(at, on_unused_input="ignore") for graph in (mine, own))
+        assert found == expected

@@ -121,7 +121,7 @@ def test_nuts_from_the_points_of_a_slow_walk(caplog, nuts_follows):
 
 def test_in_very_many_dimensions_nuts_follows_the_first_walk(caplog, walks):
     """140 normal parameters, widths from 1 to 0.001: means are zero, within four errors."""
-    idata, _ = run(stiff(140), caplog, draws=250, chains=2)
+    idata, _ = run(stiff(140), caplog, draws=250, tune=400, chains=2)
     assert len(walks) == 1
     assert idata.attrs["sampler"] == "nuts"
     x = idata["posterior"]["x"].values
@@ -131,16 +131,17 @@ def test_in_very_many_dimensions_nuts_follows_the_first_walk(caplog, walks):
 def test_no_clock_decides(request, caplog, nuts_follows, monkeypatch):
     monkeypatch.setattr(chosen_sampler, "TIME_LIMIT", np.inf)  # which alone depends on one
     call = {"draws": 100, "tune": 200}
-    first = run(stiff(), caplog, **call)[0]
+    first = run(stiff(8), caplog, **call)[0]
+    assert "NUTS" in first.attrs["sampler_reason"]
     request.getfixturevalue("other_clock")
-    again = run(stiff(), caplog, **call)[0]
+    again = run(stiff(8), caplog, **call)[0]
     assert again.attrs["sampler_reason"] == first.attrs["sampler_reason"]
     xr.testing.assert_equal(again["posterior"].to_dataset(), first["posterior"].to_dataset())
 
 
 def test_the_walk_goes_on_where_nuts_diverges(caplog, nuts_follows):
     """At a neck, from the draws of NUTS; each has been tried, so no message sends to the other."""
-    idata, said = run(schools(centred=True), caplog)
+    idata, said = run(schools(centred=True), caplog, draws=250)
     (told,) = (text for text in said if "DRAM, restarted from the better points," in text)
     assert "NUTS, started from its points, diverged in" in told
     assert idata.attrs["sampler_reason"] == told.removesuffix(".")

@@ -11,6 +11,7 @@ from pymc.model import Model
 
 from ...compiler.native.pytensor_function import NativeFunction
 from ...pymc_model.density import compile_raveled
+from ...pymc_model.inspection import log_density_graph
 from ...pymc_model.written_function import native_function
 from ..target.variables import RaveledVariables
 
@@ -21,7 +22,7 @@ class DensityGradient:
     """The compiled log-density and gradient of a model without noise, by all its variables."""
 
     def __init__(self, model: Model, raveled: RaveledVariables) -> None:
-        values, density = list(raveled.variables), model.logp()
+        values, density = list(raveled.variables), log_density_graph(model)
         gradient = pt.concatenate([pt.flatten(g) for g in pytensor.grad(density, values)])
         point = model.initial_point(random_seed=0)
         function, start = compile_raveled(point, [density, gradient], values)

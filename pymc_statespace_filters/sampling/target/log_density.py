@@ -27,7 +27,12 @@ from ...parallel.communicator import Communicator
 from ...parallel.signals import held_interrupts
 from ...pymc_model.density import compile_density, compile_raveled
 from ...pymc_model.graph_rewrites import autoregressive_noise, with_filter, with_likelihood_callback
-from ...pymc_model.inspection import health_outputs, log_density_terms, state_space_nodes
+from ...pymc_model.inspection import (
+    health_outputs,
+    log_density_graph,
+    log_density_terms,
+    state_space_nodes,
+)
 from ...pymc_model.written_function import native_function
 from ..kernel.state import Evaluation, NativeLogDensity
 from ..kernel.transition import evaluate
@@ -72,8 +77,8 @@ class LogDensity:
     ):
         others = [v for v in model.value_vars if v not in variables]
         self.others = tuple(v.name for v in others)
-        density = model.logp() if graph is None else graph
-        outputs = [density, model.logp(vars=model.free_RVs), *health_outputs([density])]
+        density = log_density_graph(model) if graph is None else graph
+        outputs = [density, log_density_graph(model, model.free_RVs), *health_outputs([density])]
         self._n_healths = len(outputs) - 2
         noise_inputs: list[Variable] = []
         noise: list[Variable] = []

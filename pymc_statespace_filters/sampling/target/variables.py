@@ -87,7 +87,7 @@ def check_noise_dependencies(
     ModelError
         If a term of the log-density that contains a seed depends on a variable not sampled.
     """
-    for term in model.logp(sum=False):
+    for _, term in log_density_terms(model):
         inputs = set(ancestors([term]))
         noisy = [name for name, seed in seeds.items() if seed in inputs]
         rest = [v for v in model.value_vars if v in inputs and v not in sampled]
