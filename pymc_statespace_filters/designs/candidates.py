@@ -43,10 +43,7 @@ class Candidate(NamedTuple):
 def read_designs(designs: Any, rivals: Mapping[str, Rival]) -> dict[str, list[Candidate]]:
     """Each design for all models.
 
-    Raises
-    ------
-    ModelError
-        If a model cannot take a design, or models would measure at different times.
+    Raises `ModelError` if a model cannot take a design, or models would measure at different times.
     """
     if not isinstance(designs, Mapping) or not designs:
         raise ModelError(f"designs must be a dict of designs by name, got {designs!r}")

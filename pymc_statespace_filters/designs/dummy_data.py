@@ -14,10 +14,7 @@ from ..pymc_model.inspection import state_space_nodes
 def with_dummy_data(model: pm.Model) -> pm.Model:
     """The model with data for StateSpace variables that have none: numbers that nothing reads.
 
-    Raises
-    ------
-    ModelError
-        If there is no StateSpace variable, or one with censored data.
+    Raises `ModelError` if there is no StateSpace variable, or one with censored data.
     """
     nodes = state_space_nodes(model)
     if not nodes:

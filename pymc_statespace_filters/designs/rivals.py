@@ -68,12 +68,8 @@ def read_rivals(
 ) -> dict[str, Rival]:
     """The models with draws of their priors, or of ``idata``, a DataTree or one for each model.
 
-    Raises
-    ------
-    ModelError
-        If a model has no repeatable likelihood of one record, or too few draws.
-    DataMismatchError
-        If draws are those of another model.
+    Raises `ModelError` if a model has no repeatable likelihood of one record, or too few draws;
+    `DataMismatchError` if draws are those of another model.
     """
     if idata is not None and not isinstance(idata, Mapping | xr.DataTree):
         raise ModelError(f"idata must be a DataTree, or a dict of them by model, got {idata!r}")

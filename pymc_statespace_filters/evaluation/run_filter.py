@@ -249,11 +249,8 @@ def states_before(
 ) -> list[np.ndarray]:
     """The state from which each record goes on, by their labels; None is a single record.
 
-    Raises
-    ------
-    ModelError
-        If the earlier run is not one of the same filter, system, parameters, seed and records, or
-        failed.
+    Raises `ModelError` if the earlier run is not one of the same filter, system, parameters, seed
+    and records, or failed.
     """
     if not isinstance(state, xr.Dataset) or STATE not in state:
         raise ModelError(f"state must be what run_filter returned, got {type(state).__name__}")

@@ -26,13 +26,9 @@ class ExactDensity:
 
     ``is_exact`` tells whether the filter is exact in the mean for all of them, which are ``names``,
     and ``n_noisy`` how many seeds an estimate has: one for each variable, or none without noise.
-    ``on_progress`` is called with the number of estimates since its last call.
-
-    Raises
-    ------
-    ModelError
-        If there is no such variable, the filter cannot treat its system or is biased, or it is that
-        of the model already.
+    ``on_progress`` is called with the number of estimates since its last call. Raises `ModelError`
+    if there is no such variable, the filter cannot treat its system or is biased, or it is that of
+    the model already.
     """
 
     def __init__(self, model: pm.Model, filter: Filter) -> None:

@@ -41,12 +41,8 @@ class OneOrder:
     """Draws and density of declared labels in one order: ascending in the first variable of them.
 
     ``exchangeable`` is as of `estimate_evidence`; ``ordered`` are the variables that a transform
-    keeps in order, so that nothing needs to be sorted.
-
-    Raises
-    ------
-    ModelError
-        If the argument is invalid, or the density changes where labels are exchanged.
+    keeps in order, so that nothing needs to be sorted. Raises `ModelError` if the argument is
+    invalid, or the density changes where labels are exchanged.
     """
 
     def __init__(

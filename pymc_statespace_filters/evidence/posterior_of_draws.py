@@ -26,13 +26,8 @@ def build_posterior(idata: xr.DataTree, density: ModelDensity) -> tuple[Posterio
 
     ``sample_stats`` may have the log-density ``lp`` of each draw; it must have it, or the noise
     seeds ``<name>_seed``, if the noise was refreshed along the chain. Also returns the treatment of
-    the noise: "none", "refreshed" or "held", as in `Evidence`.
-
-    Raises
-    ------
-    ModelError, DataMismatchError
-        As `check_one_model` and `unconstrained_draws`; and if stored and recomputed log-densities
-        disagree.
+    the noise: "none", "refreshed" or "held", as in `Evidence`. Raises as `check_one_model` and
+    `unconstrained_draws`, and `DataMismatchError` if stored and recomputed log-densities disagree.
     """
     check_one_model(idata, density.model)
     draws = unconstrained_draws(idata, density.model)

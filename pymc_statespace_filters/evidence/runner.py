@@ -60,18 +60,9 @@ def run_estimators(
     """Run estimators with different names on the same draws, and report an `Evidence` for each.
 
     With another ``filter`` the evidence is that of the model with it. The other arguments are those
-    of `chib_jeliazkov`.
-
-    Warns
-    -----
-    EvidenceWarning
-        Once for all problems that do not depend on the estimator, and once if the error of the
-        estimate that is taken is doubtful or too large.
-
-    Raises
-    ------
-    ModelError
-        If estimators average the draws where these may only say where the posterior lies.
+    of `chib_jeliazkov`. Raises `ModelError` if estimators average the draws where these may only
+    say where the posterior lies. Warns once for all problems that do not depend on the estimator,
+    and once if the error of the estimate that is taken is doubtful or too large.
     """
     _check_guided(estimators, idata, filter)
     model = model_of_draws(model, idata)

@@ -3,7 +3,7 @@
 from typing import ClassVar
 
 from ..compiler.native.plan import Plan
-from .protocol import System
+from .protocol import DifferentiableFilter, System
 
 
 class TapedFilter:
@@ -12,17 +12,6 @@ class TapedFilter:
     noisy: ClassVar[bool] = False
     has_gradient: ClassVar[bool] = True
 
-    def plan_of_pass(
-        self,
-        system: System,
-        *,
-        of_many: bool = False,
-        leaves_tape: bool = False,
-        goes_back: bool = False,
-    ) -> Plan:
-        """Plan a pass along a record; one that leaves a tape and goes back is the gradient."""
-        raise NotImplementedError
-
-    def plan_of_likelihood(self, system: System) -> Plan:
+    def plan_of_likelihood(self: DifferentiableFilter, system: System) -> Plan:
         """Plan the log-likelihood."""
         return self.plan_of_pass(system)

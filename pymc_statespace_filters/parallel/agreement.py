@@ -14,10 +14,7 @@ def check_same_call(
 ) -> None:
     """Raise, on all ranks, unless all have the same settings; ``advice`` is for some of them.
 
-    Raises
-    ------
-    DataMismatchError
-        If they differ; the message names what does.
+    The `DataMismatchError` names what differs.
     """
     first, *others = comm.allgather(comm.run_collectively(settings))
     for rank, theirs in enumerate(others, start=1):

@@ -303,19 +303,9 @@ def communicator_of(comm: Any, *, in_lockstep: bool = True) -> Communicator:
     """Make a `Communicator` of the argument ``comm``, on all its ranks.
 
     "world" is all ranks that mpiexec started, or this process alone without mpiexec. Ranks in
-    lockstep will evaluate one likelihood, so that their environments must be equal.
-
-    Raises
-    ------
-    ModelError
-        If it is something else.
-    ParallelError
-        If MPI is not available, or the environments of ranks in lockstep differ.
-
-    Warns
-    -----
-    ParallelWarning
-        If the environments of other ranks differ.
+    lockstep will evaluate one likelihood, so that their environments must be equal; those of others
+    are warned of. Raises `ModelError` if it is something else; `ParallelError` if MPI is not
+    available, or the environments of ranks in lockstep differ.
     """
     communicator = Communicator(mpi_communicator(comm))
     if communicator.size > 1:

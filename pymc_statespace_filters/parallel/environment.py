@@ -35,17 +35,8 @@ def check_environments(reports: list[dict[str, str]], rank: int, *, in_lockstep:
     """Check that all ranks have the same software and processor, by `describe_environment` of each.
 
     Ranks in lockstep evaluate one likelihood, so that their results must be bitwise equal.
-    Otherwise each runs whole chains, which are correct in any environment.
-
-    Raises
-    ------
-    ParallelError
-        If they differ and are in lockstep.
-
-    Warns
-    -----
-    ParallelWarning
-        On rank 0, if they differ and are not in lockstep.
+    Otherwise each runs whole chains, which are correct in any environment. Raises `ParallelError`
+    if they differ and are in lockstep; warns on rank 0 if they differ and are not.
     """
     found = "; ".join(_differences(reports))
     if not found:

@@ -40,14 +40,9 @@ def mpi_communicator(comm: Any) -> Any:
     """Resolve the argument ``comm`` of public functions to a communicator of mpi4py, or None.
 
     "world" is all ranks that were started together, or this process alone (None) if it was started
-    neither by mpiexec nor by ``python -m mpi4py``, in which case mpi4py is not imported.
-
-    Raises
-    ------
-    ModelError
-        If it is something else, or a communicator that was freed.
-    ParallelError
-        If MPI is not available, or the launcher belongs to another MPI.
+    neither by mpiexec nor by ``python -m mpi4py``, in which case mpi4py is not imported. Raises
+    `ModelError` if it is something else, or a communicator that was freed; `ParallelError` if MPI
+    is not available, or the launcher belongs to another MPI.
     """
     if comm is None:
         return None

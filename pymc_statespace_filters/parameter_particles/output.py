@@ -57,12 +57,8 @@ def as_datatree(
     """The result of a run of a model with the data ``observed``.
 
     ``maximum`` is the largest log-likelihood found, of the evidence; ``data`` is the way in which
-    the data came in; ``doubts_of`` gives the doubts about filters.
-
-    Warns
-    -----
-    EvidenceWarning
-        If the populations disagree, or moves are rarely accepted.
+    the data came in; ``doubts_of`` gives the doubts about filters. Warns if the
+    populations disagree, or moves are rarely accepted.
     """
     particles = run.cloud.others.particles
     index = merged_index(

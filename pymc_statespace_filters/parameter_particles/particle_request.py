@@ -51,10 +51,7 @@ class Request(NamedTuple):
     def settings(self, model: pm.Model, data: str, *, is_seeded: bool) -> dict[str, Any]:
         """All that a run depends on, as values of JSON.
 
-        Raises
-        ------
-        ModelError
-            If a part of the model has no text that is the same in every process.
+        Raises `ModelError` if a part of the model has no text that is the same in every process.
         """
         return {
             "sampler": BY_PARTICLES,

@@ -68,12 +68,8 @@ def stored(progress: Progress, request: Request) -> xr.Dataset | None:
 def restored(idata: xr.DataTree, model: pm.Model) -> tuple[Progress, Request]:
     """The run of a result of a model, with the record that it has seen.
 
-    Raises
-    ------
-    ModelError
-        If the result is not of a sequential run that can go on.
-    DataMismatchError
-        If it is of another model.
+    Raises `ModelError` if the result is not of a sequential run that can go on; `DataMismatchError`
+    if it is of another model.
     """
     if not isinstance(idata, xr.DataTree) or GROUP not in idata.children:
         raise ModelError(

@@ -46,10 +46,7 @@ def steps_stored_in(
 ) -> Iterator[StoredSteps]:
     """Open the folder of a checkpoint, or none; ``settings`` are all that the run depends on.
 
-    Raises
-    ------
-    DataMismatchError, ModelError, CheckpointError
-        As `open_checkpoint` and `RecordFile.read`.
+    Raises as `open_checkpoint` and `RecordFile.read`.
     """
     if folder is None:
         yield StoredSteps()

@@ -132,10 +132,7 @@ def _fitted(
 ) -> _Surface:
     """Fit a quadratic to estimates around a point.
 
-    Raises
-    ------
-    EdgeError
-        If too many of the estimates are zero.
+    Raises `EdgeError` if too many of the estimates are zero.
     """
     k = len(centre)
     q = 1 + 2 * k + k * (k + 1) // 2

@@ -178,10 +178,7 @@ def _refined_inside(
 def _refined(function: BatchFunction, point: Array, scale: Array, spread: Array) -> _Local:
     """Newton steps from a point near the maximum, in scales of one standard error.
 
-    Raises
-    ------
-    EdgeError
-        If the function is -inf within the differences.
+    Raises `EdgeError` if the function is -inf within the differences.
     """
     local = _derivatives_at(function, point, scale)
     for i in range(N_REFINED):

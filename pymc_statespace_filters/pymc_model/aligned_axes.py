@@ -68,7 +68,12 @@ def follow(
         else:
             status = _aligned(node.op, node, inputs, point)
             if status is None:
-                status = Mixed(_smallest(through))
+                elsewhere = _union(
+                    behind[variable]
+                    for variable, one in zip(node.inputs, inputs, strict=True)
+                    if isinstance(one, Aligned) and one.records != rows
+                )
+                status = Mixed(_smallest(elsewhere or through))
         for output in node.outputs:
             found[output], behind[output] = status, through
     return found

@@ -47,12 +47,8 @@ def checked_model(
 
     What was stored with the draws is compared: the data, the filters, and the log-density of some
     draws. With ``any_filter`` the filter of the model is not used. ``new_data`` is whether other
-    data are meant, so that nothing is compared; None where they never are.
-
-    Raises
-    ------
-    DataMismatchError
-        If the draws are those of another model.
+    data are meant, so that nothing is compared; None where they never are. Raises
+    `DataMismatchError` if the draws are those of another model.
     """
     model = model_of_draws(model, idata)
     if new_data or not isinstance(idata, xr.DataTree) or idata.attrs.get("sampler") == AVERAGED:
@@ -115,10 +111,7 @@ def _with_filters_of(idata: xr.DataTree, model: pm.Model, any_filter: bool) -> p
 def _check_density(idata: xr.DataTree, model: pm.Model, remedy: str) -> None:
     """Raise a `DataMismatchError` if stored log-densities are not those of the model.
 
-    Raises
-    ------
-    ModelError
-        If the draws are not of all variables, or not of continuous ones.
+    A `ModelError` if the draws are not of all variables, or not of continuous ones.
     """
     posterior = posterior_group(idata)
     labels = {dim: posterior[dim].values for dim in ("chain", "draw")}

@@ -24,13 +24,9 @@ def model_fingerprint(model: pm.Model) -> str:
     deterministic, name, dimension, coordinate and initial value, with the equations of a
     `StateSpace` and with the settings of its filter. Of observed values and other data it includes
     type and name: see `model_data_fingerprint`. Of a user-defined operation it includes the
-    properties or attributes, not the Python code.
-
-    Raises
-    ------
-    ModelError
-        If an operation has an attribute without a text that is the same in every process, such as
-        a Python function without a name; the message names both.
+    properties or attributes, not the Python code. Raises `ModelError` if an operation has an
+    attribute without a text that is the same in every process, such as a Python function without a
+    name; the message names both.
     """
     known = {value: digest("value of", rv.name) for rv, value in _roots(model).items()}
     names = {

@@ -21,10 +21,7 @@ from .random_variable import make_seed
 def model_with_filters(model: pm.Model, filters: Mapping[str, Filter]) -> pm.Model:
     """A copy of a model in which some StateSpace variables, by name, have another filter.
 
-    Raises
-    ------
-    ModelError
-        If a filter cannot treat the system.
+    Raises `ModelError` if a filter cannot treat the system.
     """
     fgraph, memo = fgraph_from_model(_without_initial_values(model), inlined_views=True)
     seeds = {}
@@ -55,10 +52,7 @@ def _without_initial_values(model: pm.Model) -> pm.Model:
 def model_with(model: pm.Model, name: str, filter: Any) -> pm.Model:
     """A model whose StateSpace variables all have a filter, the argument ``name`` of a user.
 
-    Raises
-    ------
-    ModelError
-        If it is no filter, cannot treat a system, or there is no such variable.
+    Raises `ModelError` if it is no filter, cannot treat a system, or there is no such variable.
     """
     if not is_filter(filter):
         raise ModelError(f"{name} must be a filter, such as psf.EnKF(200), got {filter!r}")
@@ -71,11 +65,7 @@ def model_of_draws(model: pm.Model | None, idata: Any) -> pm.Model:
     """The given model, with the filters by which draws of `sample_smc` were made.
 
     Those had another one inside, or more members at the end. A filter of a user's own class stays.
-
-    Raises
-    ------
-    DataMismatchError
-        If a sequential run has seen other data than those of the model.
+    Raises `DataMismatchError` if a sequential run has seen other data than those of the model.
     """
     model = given_model(model)
     if not isinstance(idata, xr.DataTree) or idata.attrs.get("sampler") != BY_PARTICLES:

@@ -73,12 +73,8 @@ def populations_of(idata: xr.DataTree) -> NDArray[np.int64] | None:
 def check_one_model(idata: xr.DataTree, model: pm.Model) -> None:
     """Raise unless the draws can be those of the posterior of a model.
 
-    Raises
-    ------
-    ModelError
-        If they are averaged over sub-models, and so have no one density.
-    DataMismatchError
-        As `check_same_rows`.
+    Raises `ModelError` if they are averaged over sub-models, and so have no one density; else as
+    `check_same_rows`.
     """
     if isinstance(idata, xr.DataTree) and idata.attrs.get("sampler") == AVERAGED:
         raise ModelError(

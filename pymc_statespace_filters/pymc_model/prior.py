@@ -20,7 +20,7 @@ from ..errors import GradientUnavailableError, ModelError
 from .density import RowFunction, check_free_variables
 from .elements import places_in_vector
 from .inspection import log_density_graph
-from .prior_draws import PriorDraws
+from .prior_draws import PriorDraws, naming_what_fails
 
 _IMPROPER = (FlatRV, HalfFlatRV, ICARRV)  # PyMC's densities without a finite integral
 _N_TRIED = 50  # draws to test whether a transform is invertible on the whole support
@@ -160,7 +160,8 @@ class ModelPrior:
                 "a part of the distribution's support, and the density is not normalised"
             )
         try:
-            found = self._draws(count, rng)
+            with naming_what_fails(model):
+                found = self._draws(count, rng)
         except NotImplementedError as error:
             raise ModelError(f"the prior cannot be sampled: {error}") from None
         if on_edge := int((~np.isfinite(found)).any(axis=-1).sum()):

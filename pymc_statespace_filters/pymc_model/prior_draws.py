@@ -1,6 +1,7 @@
 """Draws of a model's free variables, many in one call where their distributions allow it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 import pymc as pm
@@ -17,7 +18,10 @@ from pytensor.scan.op import Scan
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
+from ..errors import ModelError
+
 _AT_ONCE = 100  # draws, whose covariances, for one, are all in memory
+_N_TRIED = 1000  # draws of a variable, of which one may fail
 # Where the distributions are defined that draw arrays of any size, from arrays of parameters: all
 # but `Interpolated`.
 _KNOWN = "pytensor.tensor.random.basic", "pymc.distributions.continuous"
@@ -60,6 +64,32 @@ class PriorDraws:
     def _drawn(self, zeros: Array) -> Array:
         columns = [np.reshape(values, (len(zeros), -1)) for values in self._function(zeros)]
         return np.concatenate(columns, axis=1, dtype=np.float64)
+
+
+@contextmanager
+def naming_what_fails(model: pm.Model) -> Iterator[None]:
+    """Name the variable whose prior, at values of the others, has a negative scale or such."""
+    try:
+        yield
+    except ValueError as error:
+        free = set(model.free_RVs)
+        for rv in model.free_RVs:
+            made_of = [v.name for v in ancestors([rv], blockers=free - {rv}) if v in free - {rv}]
+            if made_of and not _can_be_drawn(rv):
+                raise ModelError(
+                    f"the prior of {rv.name} cannot be drawn at some values of "
+                    f"{', '.join(made_of)} ({str(error).splitlines()[0]}): give these a prior on "
+                    "the values that it allows, as pm.HalfNormal for a standard deviation"
+                ) from None
+        raise
+
+
+def _can_be_drawn(rv: TensorVariable) -> bool:
+    try:
+        pm.draw(rv, _N_TRIED, random_seed=0, mode="FAST_COMPILE")
+    except ValueError:
+        return False
+    return True
 
 
 def _first_parameters(outputs: Sequence[Variable]) -> list[Variable]:

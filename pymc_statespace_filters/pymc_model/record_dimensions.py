@@ -18,13 +18,9 @@ def in_order_of_records(
 ) -> dict[str, Any]:
     """Values of parameters; those of each record are aligned by the coordinates of the records.
 
-    Coordinates that count from zero are none, unless the labels of the records do as well.
-
-    Raises
-    ------
-    ModelError
-        If the coordinates are not the labels of the records, or in another order where the records
-        may be replaced.
+    Coordinates that count from zero are none, unless the labels of the records do as well. Raises
+    `ModelError` if the coordinates are not the labels of the records, or in another order where the
+    records may be replaced.
     """
     n_axes = {
         name: len(shape)

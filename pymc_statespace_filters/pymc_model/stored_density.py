@@ -90,10 +90,7 @@ def compared(
 ) -> Array:
     """The stored log-densities (chain, draw), of which some are recomputed.
 
-    Raises
-    ------
-    DataMismatchError
-        If they disagree; ``remedy`` ends the message.
+    Raises `DataMismatchError` if they disagree; ``remedy`` ends the message.
     """
     stored = stats[name].transpose("chain", "draw").values.astype(np.float64)
     if density.moved or has_seeds_of_records(stats, density):  # cannot be recomputed

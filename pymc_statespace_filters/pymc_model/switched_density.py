@@ -71,12 +71,8 @@ class SwitchedDensity(RowFunction):
 
     Free variables are continuous, and the switches are of elements with densities of their own.
     ``blocks`` (k,) has for every column of the unconstrained vector the number of its block: an
-    element, or a variable whose elements have a joint density alone.
-
-    Raises
-    ------
-    ModelError
-        If an element that is to be held has no density of its own.
+    element, or a variable whose elements have a joint density alone. Raises `ModelError` if an
+    element that is to be held has no density of its own.
     """
 
     def __init__(self, model: pm.Model, switches: Switches) -> None:

@@ -282,10 +282,7 @@ class _Written(NamedTuple):
 class WrittenFunction(NativeFunction):
     """A compiled PyTensor function as scalar code around calls of filters: a `NativeFunction`.
 
-    Raises
-    ------
-    NotUnrollableError
-        If it has no such form, or is too large.
+    Raises `NotUnrollableError` if it has no such form, or is too large.
     """
 
     def __init__(

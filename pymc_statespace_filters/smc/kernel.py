@@ -71,10 +71,7 @@ def fitted_kernel(
 ) -> Kernel:
     """The kernel that moves particles distributed as those of one population.
 
-    Raises
-    ------
-    ModelError
-        If the particles do not vary in every direction.
+    Raises `ModelError` if the particles do not vary in every direction.
     """
     x = population.resampled(population.log_weights.shape[1], rng).x
     found = standardised(x)

@@ -121,10 +121,8 @@ class VariableAtDraws:
     def warn_about(self, health: Sequence[Array], seeds: Sequence[NDArray[np.int64]]) -> None:
         """Warn of failures and of collapse, given health (draws, 3) and seeds of every record.
 
-        Raises
-        ------
-        ModelError
-            If the filter fails with a noise seed with which the draw's chain had a likelihood.
+        Raises `ModelError` if the filter fails with a noise seed with which the draw's chain had a
+        likelihood.
         """
         self._check_seeds(np.any([each[:, 1] != NONE for each in health], axis=0))
 

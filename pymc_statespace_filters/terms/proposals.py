@@ -81,12 +81,8 @@ class Guide:
     """The posterior of the full model, as proposals of its sub-models need it.
 
     It is given by unconstrained draws (n, k), and ``values`` (n, k), the same as the variables have
-    them; NaN for those whose transform changes shape.
-
-    Raises
-    ------
-    ModelError
-        If the draws do not vary in every direction.
+    them; NaN for those whose transform changes shape. Raises `ModelError` if the draws do not vary
+    in every direction.
     """
 
     def __init__(

@@ -436,6 +436,17 @@ def test_a_vector_as_long_as_the_panel_that_is_none_of_its_records():
     check_terms(model, found)
 
 
+def test_an_effect_of_as_many_groups_as_records_is_not_own():
+    with pm.Model() as model:
+        of_group = pm.Normal("of_group", shape=3)
+        z = pm.Normal("z", shape=3)
+        panel(rate=0.3, level=of_group[[1, 0, 1]] + z)
+    found = panel_structure(model)
+    assert [value.name for value in found.own] == ["z"]
+    assert [value.name for value in found.population] == ["of_group"]
+    check_terms(model, found)
+
+
 def test_a_model_without_a_panel_has_no_structure():
     with pm.Model() as model:
         pm.Normal("rate", shape=3)

@@ -150,6 +150,10 @@ def test_the_generator_decides_the_draws(model):
             "the prior cannot be sampled: .*_free'",
         ),
         (
+            lambda: pm.Normal("free", 0.0, pm.Normal("tau", shape=2)),
+            r"the prior of free cannot be drawn at some values of tau \(scale < 0\): give these",
+        ),
+        (
             lambda: pm.Beta("free", 1e-3, 1e-3),
             r"\d+ of 20 draws of the prior are rounded to the edge of their support",
         ),

@@ -80,12 +80,8 @@ def finite_states(model: StateSpaceModel, declared: Declared = ()) -> FiniteStat
     """The finite states of a system.
 
     ``declared`` are values of states by name: these are reached even if the start does not lead
-    there, and no others are.
-
-    Raises
-    ------
-    ModelError
-        If there are too many joint values, or a state has values that were not declared.
+    there, and no others are. Raises `ModelError` if there are too many joint values, or a state has
+    values that were not declared.
     """
     search = _Search(model, {model.states.index(name): values for name, values in declared})
     while (found := search.attempt()) is None:

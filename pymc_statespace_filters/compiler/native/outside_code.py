@@ -25,13 +25,9 @@ class UnknownValueError(Exception):
 def identity_of(function: Any, known: Known) -> tuple:
     """A tuple that is equal for functions that numba compiles to the same code, in any process.
 
-    ``known`` returns the key of a function that has one by its module; None if it has not.
-
-    Raises
-    ------
-    UnknownValueError
-        If the function refers to what is neither a number, a text, an array, a tuple of these, a
-        module, a class of named tuples nor a numba function.
+    ``known`` returns the key of a function that has one by its module; None if it has not. Raises
+    `UnknownValueError` if the function refers to what is neither a number, a text, an array, a
+    tuple of these, a module, a class of named tuples nor a numba function.
     """
     return _Described(known).value(function)
 

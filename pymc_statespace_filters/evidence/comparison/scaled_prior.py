@@ -84,10 +84,7 @@ UNKNOWN = ReweightedEvidence(np.nan, np.nan, 0.0, np.inf, 0.0)
 class ScaledPrior:
     """The priors of some free variables of a model, scaled by a common factor.
 
-    Raises
-    ------
-    ModelError
-        If a prior is improper or its support cannot be scaled.
+    Raises `ModelError` if a prior is improper or its support cannot be scaled.
     """
 
     def __init__(self, model: pm.Model, names: Iterable[str]) -> None:

@@ -80,15 +80,9 @@ def select_evidences(given: Mapping[str, EvidenceLike], estimator: str | None = 
 
     Without the name of an estimator, it is that of `chosen_estimator`, with a doubt if other
     estimates of the model disagree. Estimates from the same draws have errors in common, so that a
-    combination of them would be no more certain.
-
-    Raises
-    ------
-    ModelError
-        If an entry is of another type, the estimator is missing, or several estimates of a model
-        have no standard error.
-    DataMismatchError
-        If the models belong to different data.
+    combination of them would be no more certain. Raises `ModelError` if an entry is of another
+    type, the estimator is missing, or several estimates of a model have no standard error;
+    `DataMismatchError` if the models belong to different data.
     """
     if not isinstance(given, Mapping) or not given:
         raise ModelError(

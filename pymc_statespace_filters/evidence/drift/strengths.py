@@ -89,10 +89,7 @@ def _strengths_of_systems(model: pm.Model) -> Iterator[str]:
 class StrengthsAtPoints:
     """The values of free variables with these names at points of the unconstrained space.
 
-    Raises
-    ------
-    ModelError
-        If zero is neither the lower end nor the middle of the support of one.
+    Raises `ModelError` if zero is neither the lower end nor the middle of the support of one.
     """
 
     def __init__(self, model: pm.Model, names: Sequence[str]) -> None:

@@ -43,10 +43,7 @@ class WithGradient:
     def slopes(self, x: Array) -> Array:
         """Gradients (m, k).
 
-        Raises
-        ------
-        EdgeError
-            If the function is not finite at one of the points.
+        Raises `EdgeError` if the function is not finite at one of the points.
         """
         values, found = self.with_slopes(x)
         if not (np.isfinite(values).all() and np.isfinite(found).all()):
@@ -94,11 +91,7 @@ def derivatives(function: BatchFunction, point: Array, step: float) -> tuple[Arr
 
     A mixed derivative takes only two further points, f(x + h e_i + h e_j) and f(x - h e_i - h e_j),
     beside the points along the axes. The differences of a known gradient take 2 k + 1 points.
-
-    Raises
-    ------
-    EdgeError
-        If the function is not finite at one of the points.
+    Raises `EdgeError` if the function is not finite at one of the points.
     """
     k = len(point)
     axes = step * np.eye(k)
@@ -126,10 +119,7 @@ def derivatives(function: BatchFunction, point: Array, step: float) -> tuple[Arr
 def gradient(function: BatchFunction, point: Array, step: float) -> Array:
     """Gradient (k,), known or by central differences; 2 k points in one call.
 
-    Raises
-    ------
-    EdgeError
-        If the function is not finite at one of the points.
+    Raises `EdgeError` if the function is not finite at one of the points.
     """
     if isinstance(function, WithGradient):
         return function.slopes(point[None])[0]

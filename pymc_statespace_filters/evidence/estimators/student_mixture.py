@@ -33,11 +33,7 @@ def choose_mixture(posterior: Posterior, rng: np.random.Generator) -> StudentMix
 
     Components are added to a fit of one half of the draws (`Posterior.halves_for_fit`) as long as
     this lowers the second moment of the weights w = p / q on the other half: E_q[w^2] = E_p[w].
-
-    Raises
-    ------
-    ModelError
-        If the draws do not vary in every direction.
+    Raises `ModelError` if the draws do not vary in every direction.
     """
     mean, chol = coordinates = moments(posterior.draws)
     halves = [half.thinned(MOST_FITTED // 2) for half in posterior.halves_for_fit()]

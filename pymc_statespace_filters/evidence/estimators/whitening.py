@@ -39,10 +39,7 @@ class Whitening(NamedTuple):
 def moments(draws: Array) -> Whitening:
     """Mean and lower Cholesky factor of the covariance of draws (..., k).
 
-    Raises
-    ------
-    ModelError
-        If the draws do not vary in every direction.
+    Raises `ModelError` if the draws do not vary in every direction.
     """
     k = draws.shape[-1]
     flat = draws.reshape(-1, k)
@@ -53,12 +50,7 @@ def moments_within_chains(draws: Array) -> Whitening:
     """Mean of draws (chain, draw, k), and the factor of their covariance within chains.
 
     Between-chain variance is excluded: with chains in separate modes it would hide the widths of
-    the modes.
-
-    Raises
-    ------
-    ModelError
-        If the draws do not vary in every direction.
+    the modes. Raises `ModelError` if the draws do not vary in every direction.
     """
     about_mean = (draws - draws.mean(axis=1, keepdims=True)).reshape(-1, draws.shape[-1])
     count = len(about_mean)

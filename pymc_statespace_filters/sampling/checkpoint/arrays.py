@@ -20,10 +20,7 @@ class Stored(NamedTuple):
 def encoded(key: str, draws: Arrays, state: Arrays) -> bytes:
     """One record: the draws since the one before, and the whole state after them.
 
-    Raises
-    ------
-    ValueError
-        If an array has Python objects.
+    Raises `ValueError` if an array has Python objects.
     """
     parts = [{name: np.asarray(array) for name, array in some.items()} for some in (draws, state)]
     arrays = [array for part in parts for array in part.values()]

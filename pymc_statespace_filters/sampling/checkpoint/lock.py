@@ -22,12 +22,7 @@ _NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP}
 def locked(folder: Path) -> FileLock:
     """Lock a folder until the lock is released, or the process ends.
 
-    Raises
-    ------
-    ModelError
-        If another process has the lock.
-    OSError
-        If the folder is not writable.
+    Raises `ModelError` if another process has the lock; `OSError` if the folder is not writable.
     """
     lock = FileLock(folder / _LOCK, thread_local=False, fallback_to_soft=False)
     note, here = folder / _OWNER, platform.node()

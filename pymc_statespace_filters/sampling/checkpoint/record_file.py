@@ -64,12 +64,8 @@ class RecordFile:
     """A file of records, written by one process, of which any thread may use this object.
 
     If there is no such file, it is made. The header identifies the run: that of a file that is
-    there must be the same; see `header_of`.
-
-    Warns
-    -----
-    CheckpointWarning
-        If the file was cut at a record that is not whole.
+    there must be the same; see `header_of`. Warns if the file was cut at a record
+    that is not whole.
     """
 
     def __init__(self, path: Path, header: str):
@@ -80,15 +76,9 @@ class RecordFile:
         """Write one record; when this returns, it is on the disk.
 
         It has the draws (new draws, ...) since the last record, under the same names each time,
-        numbers or booleans, and the whole state after them.
-
-        Raises
-        ------
-        CheckpointError
-            If it cannot be written, for example because the disk is full: it is then not there, and
-            those before it are. Or if the file is not as this process has left it.
-        ValueError
-            If an array has Python objects.
+        numbers or booleans, and the whole state after them. Raises `CheckpointError` if the file is
+        not as this process has left it, or the record cannot be written, for example because the
+        disk is full: it is then not there, and those before it are.
         """
         self.append_encoded(encoded(key, draws, state))
 
@@ -119,10 +109,7 @@ class RecordFile:
     def read(self, key: str) -> Stored | None:
         """The draws in all records of a key, and the last state; None if there are none.
 
-        Raises
-        ------
-        CheckpointError
-            If the file cannot be read, or was damaged since it was opened.
+        Raises `CheckpointError` if the file cannot be read, or was damaged since it was opened.
         """
         with self._lock, self._named_errors("read"):
             return joined(self._records(key)) if key in self._index.places else None
@@ -194,10 +181,7 @@ class RecordFile:
 def header_of(path: Path) -> str:
     """The header of a file of records.
 
-    Raises
-    ------
-    ValueError
-        If the file is of another format, or its header is damaged.
+    Raises `ValueError` if the file is of another format, or its header is damaged.
     """
     with open(path, "rb") as file:
         return _read_header(file)

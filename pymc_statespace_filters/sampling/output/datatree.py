@@ -51,12 +51,8 @@ def to_datatree(
     were interrupted at different iterations, those are kept, and cut to one length, that give the
     most draws in all. The warm-up is kept in separate groups, if at all. ``stat_dims`` has name and
     coordinates of the dimension of statistics that are vectors, ``attrs`` attributes of the groups
-    with draws and statistics, in addition to PyMC's.
-
-    Raises
-    ------
-    ModelError
-        If no iteration is to be kept.
+    with draws and statistics, in addition to PyMC's. Raises `ModelError` if no iteration is to be
+    kept.
     """
     skipped = 0 if keep_warmup else tune
     lengths = [len(positions) for positions, _ in chains]

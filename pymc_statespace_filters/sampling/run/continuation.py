@@ -86,12 +86,8 @@ def former_chains(
 ) -> FormerChains:
     """The chains of a run of this model, to go on with.
 
-    Raises
-    ------
-    ModelError
-        If the draws are not of chains that can go on, or with other settings.
-    DataMismatchError
-        If they are of another model or of other data.
+    Raises `ModelError` if the draws are not of chains that can go on, or with other settings;
+    `DataMismatchError` if they are of another model or of other data.
     """
     posterior_group(idata)
     if idata.attrs.get("sampler") == "nuts":

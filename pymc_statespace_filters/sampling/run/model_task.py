@@ -51,12 +51,7 @@ class ModelTask:
 
     ``name`` is for messages, and empty if there is only one model; ``group`` are the ranks that
     evaluate the likelihoods together, of which this is the first. The ``target`` is given if it has
-    been made already.
-
-    Raises
-    ------
-    ModelError
-        If the log-density draws random numbers.
+    been made already. Raises `ModelError` if the log-density draws random numbers.
     """
 
     def __init__(
@@ -153,12 +148,8 @@ class ModelTask:
     def find_population(self, *, progressbar: bool) -> SearchedPoints:
         """Points of the posterior, found once for all chains; none if starts are given otherwise.
 
-        None, too, if every record finds its own start, see `RecordChain.start`.
-
-        Raises
-        ------
-        ModelError
-            If no points can be found, though the pilot needs some.
+        None, too, if every record finds its own start, see `RecordChain.start`. Raises `ModelError`
+        if no points can be found, though the pilot needs some.
         """
         target = self.prepare()
         if isinstance(target, RecordTarget):

@@ -113,13 +113,9 @@ def search_population(
 ) -> SearchedPoints:
     """Points of the posterior, stored in the checkpoint; none if starts are given otherwise.
 
-    None with a short warm-up of an expensive filter, too, and if the noise is carried. A pilot
-    that lacks no variable has the points itself. ``begin`` is the beginning of messages.
-
-    Raises
-    ------
-    ModelError
-        If no points can be found, though the pilot needs some.
+    None with a short warm-up of an expensive filter, too, and if the noise is carried. A pilot that
+    lacks no variable has the points itself. ``begin`` is the beginning of messages. Raises
+    `ModelError` if no points can be found, though the pilot needs some.
     """
     pilot = None if request.pilot is None else np.array(request.pilot, dtype=np.float64)
     if pilot is not None and np.isfinite(pilot).all():

@@ -86,11 +86,8 @@ class SamplingRequest(NamedTuple):
     def cache_key(self, model: Model, *, require_fingerprint: bool = True) -> dict[str, Any]:
         """Give all that a model's draws depend on, as values of JSON.
 
-        Raises
-        ------
-        ModelError
-            If a part of the model has no text that is the same in every process. Without
-            ``require_fingerprint`` the fingerprint of the model is then left empty.
+        Raises `ModelError` if a part of the model has no text that is the same in every process.
+        Without ``require_fingerprint`` the fingerprint of the model is then left empty.
         """
         try:
             fingerprint = model_fingerprint(model)

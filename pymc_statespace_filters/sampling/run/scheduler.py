@@ -47,13 +47,8 @@ def run_chains(
     The tasks are the same on all ranks, with the same request, and prepared on rank 0, to whose
     tasks the results are added. After an interruption (Ctrl-C) some chains have made fewer
     iterations, or none. This rank runs ``n_threads`` chains at a time; rank 0 shows the progress.
-
-    Raises
-    ------
-    Exception
-        What a model raised on this rank, with a note that names the chain.
-    ParallelError
-        If it raised on another rank; the chains of this one are stopped.
+    Raises what a model raised on this rank, with a note that names the chain; `ParallelError` if it
+    raised on another rank, after the chains of this one were stopped.
     """
     with ChainPool(n_threads) as pool:
         if comm.rank > 0:

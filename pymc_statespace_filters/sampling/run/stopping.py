@@ -31,10 +31,8 @@ class Length(NamedTuple):
 def target_ess(until_ess: float | str | None, draws: int, chains: int) -> float | None:
     """Effective draws to reach with so many draws of each chain; None if none are asked for.
 
-    Raises
-    ------
-    ModelError
-        If so many draws cannot be worth that, or an argument is not as `sample` describes it.
+    Raises `ModelError` if so many draws cannot be worth that, or an argument is not as `sample`
+    describes it.
     """
     if until_ess is None:
         return None

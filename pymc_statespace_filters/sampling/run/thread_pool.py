@@ -59,10 +59,7 @@ class ChainPool:
     def finished(self, seconds: float = _REFRESH_SECONDS) -> Sequence[tuple[int, ChainTask]]:
         """Wait for chains to finish, for at most so many seconds, and remove those that have.
 
-        Raises
-        ------
-        Exception
-            What a model raised, with a note that names the chain.
+        Raises what a model raised, with a note that names the chain.
         """
         if not self._futures:
             time.sleep(seconds)

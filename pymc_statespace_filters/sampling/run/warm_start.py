@@ -33,14 +33,9 @@ def warm_started(request: SamplingRequest, model: Model, pilot: Any) -> Sampling
 
     The warm-up, which may be short, changes the proposal covariance only if the user has chosen
     how. A pilot that lacks variables of the model determines neither starts nor covariance, only
-    the population from which they are found.
-
-    Raises
-    ------
-    ModelError
-        If starts or proposals are given too, or cannot be made of the pilot's draws.
-    DataMismatchError
-        If the pilot has no variable of the model, or one of another shape or support.
+    the population from which they are found. Raises `ModelError` if starts or proposals are given
+    too, or cannot be made of the pilot's draws; `DataMismatchError` if the pilot has no variable of
+    the model, or one of another shape or support.
     """
     for name in ("initvals", "proposal_cov"):
         if getattr(request, name) is not None:
@@ -107,11 +102,8 @@ def warm_started_models(
 ) -> list[SamplingRequest]:
     """The requests of several models: a pilot for each name, or one for all that share variables.
 
-    Raises
-    ------
-    ModelError, DataMismatchError
-        As `warm_started`, with the name of the model; also if no model has the name of a pilot, or
-        none shares a variable with the only one.
+    Raises as `warm_started`, with the name of the model; also if no model has the name of a pilot,
+    or none shares a variable with the only one.
     """
     if pilot is None:
         return [request] * len(models)

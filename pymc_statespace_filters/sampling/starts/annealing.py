@@ -59,12 +59,7 @@ def anneal(
 
     ``log_densities`` gives the log-density of the first and the log-ratio at points (m, k). At
     least one draw must have a positive ratio. Gives N_SWEEPS times ``n`` points: the population
-    after every third of the last moves.
-
-    Raises
-    ------
-    ModelError
-        If the distributions lie too far apart.
+    after every third of the last moves. Raises `ModelError` if the distributions lie too far apart.
     """
     temperature, halfway, scale = 0.0, 0.0, 1.0
     for step in count():

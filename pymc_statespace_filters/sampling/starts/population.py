@@ -67,13 +67,9 @@ def population_of(
 ) -> tuple[Points, RaveledVariables]:
     """Points distributed nearly as a model's posterior, and their coordinates.
 
-    In many dimensions they are some nats below it if they do not settle along the gradient.
-
-    Raises
-    ------
-    ModelError
-        If a free variable is discrete, a prior is improper, or no draw of the prior has a positive
-        likelihood.
+    In many dimensions they are some nats below it if they do not settle along the gradient. Raises
+    `ModelError` if a free variable is discrete, a prior is improper, or no draw of the prior has a
+    positive likelihood.
     """
     if model.discrete_value_vars:
         names = [model.values_to_rvs[value].name for value in model.discrete_value_vars]
@@ -103,11 +99,8 @@ def find_population(
     """Points distributed nearly as the posterior, ``n_points`` in each of the last sweeps.
 
     ``pilot`` are draws (n, d) of a posterior close by, with columns of NaN for what it lacks.
-
-    Raises
-    ------
-    ModelError
-        If no draw of the prior has a positive likelihood, or if the model fits the record exactly.
+    Raises `ModelError` if no draw of the prior has a positive likelihood, or if the model fits the
+    record exactly.
     """
     search = partial(
         _search,

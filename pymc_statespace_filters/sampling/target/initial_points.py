@@ -17,6 +17,7 @@ from pytensor.graph.basic import Variable
 from ...errors import ModelError
 from ...filters.outcomes import Failure
 from ...pymc_model.ends_of_support import ends_of_support
+from ...pymc_model.prior_draws import naming_what_fails
 from .variables import RaveledVariables
 
 N_DRAWS = 200
@@ -49,7 +50,7 @@ class StartDraws:
         rvs = [model.values_to_rvs[v] for v in raveled.variables]
         self._has_initvals = any(model.rvs_to_initial_values[rv] is not None for rv in rvs)
         self._default = raveled.ravel(default)
-        self._raveled, self.is_prior = raveled, True
+        self._model, self._raveled, self.is_prior = model, raveled, True
         free = list(model.free_RVs)
         self._point = make_initial_point_fn(model=model, overrides=dict.fromkeys(free, "prior"))
         try:
@@ -67,7 +68,8 @@ class StartDraws:
         the model's initial point plus U(-1, 1), as in PyMC's NUTS.
         """
         seeds = range(index * N_DRAWS, (index + 1) * N_DRAWS)
-        table = np.array([self._raveled.ravel(self._point(seed)) for seed in seeds])
+        with naming_what_fails(self._model):
+            table = np.array([self._raveled.ravel(self._point(seed)) for seed in seeds])
         return table[np.isfinite(table).all(axis=1)]
 
     def candidates(self, start: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
@@ -108,11 +110,7 @@ def best_initial_point(
     Far out in the prior an estimated likelihood varies widely, and a chain that starts at an
     overestimate is slow to leave it. The best of a few draws lies closer, and the starts of several
     chains are still dispersed. Also returns, for each evaluation made, 0 or its failure code.
-
-    Raises
-    ------
-    ModelError
-        If the log-density is minus infinity at all candidates.
+    Raises `ModelError` if the log-density is minus infinity at all candidates.
     """
     failures: tuple[int, ...] = ()
     finite: list[EvaluatedPoint] = []
@@ -148,12 +146,7 @@ def chain_candidates(
     """For each chain, a function from its generator to the candidates for its start.
 
     ``initvals`` are as in ``pm.sample``; without any, candidates are drawn from the prior to
-    ``disperse`` the starts.
-
-    Raises
-    ------
-    ModelError
-        If the values do not fit the model.
+    ``disperse`` the starts. Raises `ModelError` if the values do not fit the model.
     """
     check_initvals(model, initvals, len(seeds))
     points = make_initial_point_fns_per_chain(

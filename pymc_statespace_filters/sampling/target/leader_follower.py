@@ -50,11 +50,8 @@ class _RecordArrays(NamedTuple):
 def check_group(model: Model, settings: RandomWalkSettings, n_ranks: int) -> None:
     """Check that several ranks can evaluate a model's likelihoods together.
 
-    Raises
-    ------
-    ModelError
-        If there is no noisy likelihood, its filter has fewer blocks of particles than there are
-        ranks, or the noise is correlated.
+    Raises `ModelError` if there is no noisy likelihood, its filter has fewer blocks of particles
+    than there are ranks, or the noise is correlated.
     """
     if settings.correlation is not None:
         raise ModelError(
@@ -167,12 +164,8 @@ def release_followers(comm: Communicator) -> Iterator[None]:
 def follow(comm: Communicator) -> None:
     """Take part in the evaluations of the leader, rank 0 of the group, until it sends the end.
 
-    Raises
-    ------
-    ParallelError
-        If the leader was stopped by an error.
-    Exception
-        What an evaluation raised here. It ends the whole job, as the others wait for this rank.
+    Raises `ParallelError` if the leader was stopped by an error, and what an evaluation raised
+    here, which ends the whole job, as the others wait for this rank.
     """
     failure = None
     evaluators: dict[Any, tuple[Callable, _RecordArrays]] = {}

@@ -53,12 +53,8 @@ class LogDensity:
     same variance. ``graph`` is the log-density if it is not the model's own, see
     `screening_density`. The ranks of a ``group`` evaluate the noisy likelihoods together: this one,
     the first, evaluates the log-density; the others call `leader_follower.follow`. The gradient, if
-    wanted, is the last result of `at_rows`.
-
-    Raises
-    ------
-    GradientUnavailableError
-        If the gradient is asked for and a filter has none.
+    wanted, is the last result of `at_rows`. Raises `GradientUnavailableError` if the gradient is
+    asked for and a filter has none.
     """
 
     def __init__(
@@ -207,10 +203,7 @@ class BoundLogDensity:
 def screening_density(model: Model, screen: Any, power: float) -> TensorVariable:
     """Graph of a cheap log-density: `tempered_density` with the screen for all filters.
 
-    Raises
-    ------
-    ModelError
-        If the filter does not support a system.
+    Raises `ModelError` if the filter does not support a system.
     """
     try:
         return tempered_density(model, dict.fromkeys(state_space_nodes(model), screen), power)

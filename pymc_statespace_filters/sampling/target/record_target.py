@@ -157,12 +157,8 @@ class RecordTarget(SampledModel):
 
     Of the covariance ``proposal_cov`` (d, d) of the first proposals each block takes its own part.
     If it is one of proposals of all parameters together (``of_all``), as of a pilot, it has the
-    factor 2.38^2 / d of their number, and each block that of its own.
-
-    Raises
-    ------
-    ModelError
-        As `SampledModel`, and if ``proposal_cov`` or a setting does not fit.
+    factor 2.38^2 / d of their number, and each block that of its own. Raises `ModelError` as
+    `SampledModel`, and if ``proposal_cov`` or a setting does not fit.
     """
 
     def __init__(

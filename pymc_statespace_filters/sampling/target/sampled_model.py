@@ -34,13 +34,8 @@ class SampledModel:
     ``vars`` are continuous variables, by default all; ``samples_all`` tells whether no other step
     method moves further ones. ``exact`` tells whether the chains target the posterior itself,
     without the bias of a filter's noise, and ``seed_names`` has the noise seeds, one for each noisy
-    StateSpace variable.
-
-    Raises
-    ------
-    ModelError
-        If a variable is discrete, there are none, or a noisy StateSpace depends on others than
-        ``vars``.
+    StateSpace variable. Raises `ModelError` if a variable is discrete, there are none, or a noisy
+    StateSpace depends on others than ``vars``.
     """
 
     def __init__(

@@ -122,10 +122,8 @@ class RandomWalkSettings:
 def checked_proposal_cov(proposal_cov: object, dim: int | None = None) -> np.ndarray:
     """Return the user's proposal covariance as a symmetric positive definite matrix.
 
-    Raises
-    ------
-    ModelError
-        If it is not a symmetric positive definite matrix of numbers, ``dim`` by ``dim`` if given.
+    Raises `ModelError` if it is not a symmetric positive definite matrix of numbers, ``dim`` by
+    ``dim`` if given.
     """
     size = "" if dim is None else f" {dim} x {dim}"
     expected = f"proposal_cov must be a symmetric positive definite{size} matrix, got"

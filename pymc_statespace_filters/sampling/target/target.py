@@ -37,12 +37,8 @@ class Target(SampledModel):
     """A model as the sampler sees it, whose variables are moved together.
 
     ``proposal_cov`` (d, d) is of the first proposals; ``compile_kwargs``, ``graph`` and ``group``
-    are as of `LogDensity`.
-
-    Raises
-    ------
-    ModelError
-        As `SampledModel`, and if ``proposal_cov``, the screen or the group does not fit.
+    are as of `LogDensity`. Raises `ModelError` as `SampledModel`, and if ``proposal_cov``, the
+    screen or the group does not fit.
     """
 
     def __init__(

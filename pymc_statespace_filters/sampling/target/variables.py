@@ -82,10 +82,8 @@ def check_noise_dependencies(
 ) -> None:
     """Check that no other step method moves a variable of an estimated likelihood.
 
-    Raises
-    ------
-    ModelError
-        If a term of the log-density that contains a seed depends on a variable not sampled.
+    Raises `ModelError` if a term of the log-density that contains a seed depends on a variable not
+    sampled.
     """
     for _, term in log_density_terms(model):
         inputs = set(ancestors([term]))
