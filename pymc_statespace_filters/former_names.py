@@ -67,10 +67,7 @@ _ARGUMENTS = {
 def former_names[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     """Refuse the arguments that a public function once had, or that its relatives have.
 
-    Raises
-    ------
-    TypeError
-        By the function returned, if it is called with such a name.
+    The function returned raises a `TypeError` if it is called with such a name.
 
     Examples
     --------

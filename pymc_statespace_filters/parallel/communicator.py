@@ -149,14 +149,9 @@ class Communicator:
     def run_collectively(self, function: Callable[[], Result], mark: int = 0) -> Result:
         """Call a function on every rank, and give its result here; if one raises, all do.
 
-        ``mark`` says what the function does, the same on all ranks.
-
-        Raises
-        ------
-        Exception
-            What the function raised here.
-        ParallelError
-            If it raised on another rank, which the message names; or if the marks differ.
+        ``mark`` says what the function does, the same on all ranks. Raises what the function raised
+        here; `ParallelError` if it raised on another rank, which the message names, or if the marks
+        differ.
         """
         try:
             result, failure = function(), None

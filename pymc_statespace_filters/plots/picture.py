@@ -54,24 +54,12 @@ def picture(
 ) -> PlotCollection:
     """Draw marks in panels, those that come later above the others, with a key to the right.
 
-    Parameters
-    ----------
-    panels : xarray.Dataset
-        What the panels are of.
-    marks : sequence of Mark
-    x, y, title : str, mapping of str to str, or xarray.DataArray
-        Texts of the panels: the same for all of them, by variable of `panels`, or along `cols`. One
-        for all at the x axis is written below the lowest panels.
-    cols : sequence of str
-        Dimensions along which panels differ, "__variable__" among them.
-    size : tuple of float
-        Width and height of a panel in inches.
-    in_line : int
-        Number of panels beside each other.
-    backend, pc_kwargs
-        As in the public functions. What the user gives overrides what is here.
-    aesthetics : mapping of str to Any
-        For `PlotCollection.wrap`.
+    The texts ``x``, ``y`` and ``title`` are the same for all panels, mappings by variable of
+    ``panels``, or arrays along ``cols``, the dimensions along which panels differ, "__variable__"
+    among them. One for all at the x axis is written below the lowest panels. ``size`` is that of a
+    panel in inches, of which ``in_line`` are beside each other. ``backend`` and ``pc_kwargs`` are
+    as in the public functions: what the user gives overrides what is here, and the ``aesthetics``,
+    of `PlotCollection.wrap`.
     """
     marks = [one for one in marks if any(a.notnull().any() for a in one.data.values())]
     frames = _frames(panels, cols)

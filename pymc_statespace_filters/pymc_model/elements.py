@@ -57,10 +57,7 @@ class Elements:
     def columns(self, name: Any, argument: str) -> Columns:
         """The columns that a name in an argument stands for.
 
-        Raises
-        ------
-        ModelError
-            If it is unknown, or stands for two elements.
+        Raises `ModelError` if it is unknown, or stands for two elements.
         """
         found = self.meanings.get(name, frozenset())
         if len(found) == 1:

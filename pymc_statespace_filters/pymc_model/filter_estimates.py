@@ -92,11 +92,7 @@ class VariableAtPoints:
         """The log-likelihood by a filter at every point for every seed, (m, r); -inf if it fails.
 
         ``seeds`` (m, r) are those of the noise, which a deterministic filter ignores: it needs one.
-
-        Raises
-        ------
-        ModelError
-            If the filter cannot treat the system.
+        Raises `ModelError` if the filter cannot treat the system.
         """
         return self.at(range(len(self)), filter, seeds)
 

@@ -32,16 +32,9 @@ def shared_by_ranks[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     The function has an argument ``model``, or ``models``, one or a mapping, and of ``idata``,
     ``random_seed`` and ``progressbar`` those that it needs. All ranks make the call in step: those
     without draws get them from the first rank, which alone shows bars, warns and logs. The result
-    is None, beside its type, on ranks that do not get it.
-
-    Raises
-    ------
-    ModelError
-        By the function, if ``comm`` is invalid.
-    DataMismatchError
-        If models, their data or seeds of the ranks differ.
-    ParallelError
-        If another rank has failed, or MPI cannot be used.
+    is None, beside its type, on ranks that do not get it. It raises `ModelError` if ``comm`` is
+    invalid; `DataMismatchError` if models, their data or seeds of the ranks differ; `ParallelError`
+    if another rank has failed, or MPI cannot be used.
     """
     own = signature(function)
 

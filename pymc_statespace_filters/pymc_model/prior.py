@@ -140,13 +140,10 @@ class ModelPrior:
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         """Independent draws, shape (count, k), in the order of `log_density`.
 
-        Raises
-        ------
-        ModelError
-            If a prior cannot be sampled, like ``pm.Flat``; if a transform excludes a part of the
-            support, as an ordering does, so that the density is not that of the draws; if single
-            values have a positive probability, as of ``pm.Censored``; or if draws are rounded
-            to the edge of the support, where the transform is infinite.
+        Raises `ModelError` if a prior cannot be sampled, like ``pm.Flat``; if a transform excludes
+        a part of the support, as an ordering does, so that the density is not that of the draws; if
+        single values have a positive probability, as of ``pm.Censored``; or if draws are rounded to
+        the edge of the support, where the transform is infinite.
         """
         model = self._model
         if improper := [rv.name for rv in self._free if not can_sample(rv, model)]:

@@ -57,21 +57,13 @@ class CompiledSystem:
     Each has an entry point, for machine code, and a ``function`` that Python calls with these
     arguments.
 
-    Attributes
-    ----------
-    model : StateSpaceModel
-        What the user wrote, for filters that work on its graphs. Linear algebra of parameters alone
-        is left out of them: its values are read from more parameters, see `extend`.
-    n, n_start, m, p, r, n_inputs, n_theta, n_constants : int
-        Numbers of states, of normals that a member takes at the start and in one step (see
-        `merged_noise`), of observables, of measurement noises, of columns of inputs, of parameters,
-        and the length of ``c``.
-    dt : float
-        Length of a step.
-    square_roots : dict
-        Where in ``c`` the square root of each covariance begins, by the name of the covariance.
-    free : ndarray of int
-        The states that an update may move: all but the carried ones.
+    ``model`` is what the user wrote, for filters that work on its graphs. Linear algebra of
+    parameters alone is left out of them: its values are read from more parameters, see `extend`.
+    ``n``, ``n_start``, ``m``, ``p``, ``r``, ``n_inputs``, ``n_theta`` and ``n_constants`` are the
+    numbers of states, of normals that a member takes at the start and in one step (see
+    `merged_noise`), of observables, of measurement noises, of columns of inputs, of parameters, and
+    the length of ``c``, in which ``square_roots`` has the places of those of the covariances. The
+    ``free`` states are those that an update may move: all but the carried ones.
     """
 
     def __init__(self, given: StateSpaceModel) -> None:

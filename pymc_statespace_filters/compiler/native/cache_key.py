@@ -167,13 +167,9 @@ def key_of(module: str, *parts: str | Callable | None) -> str | None:
     It covers the compilers and the sources of all modules of this package that the module reaches
     by its imports. Other modules have no key, but their functions have, see `outside_code`.
 
-    Parameters
-    ----------
-    module : str
-        The ``__name__`` of the module.
-    *parts : str, callable or None
-        What else identifies the code: texts, the keys of code that it calls (None where that
-        cannot be cached), and functions, which are covered as the module is, or by themselves.
+    ``module`` is its ``__name__``. The ``parts`` are what else identifies the code: texts, the keys
+    of code that it calls (None where that cannot be cached), and functions, which are covered as
+    the module is, or by themselves.
     """
     if module not in _SOURCES:
         return None

@@ -131,22 +131,11 @@ def _remove(path: Path) -> None:
 class EntryPoint:
     """A function that `compile` compiles on its first call, and that is called by its ``symbol``.
 
-    Parameters
-    ----------
-    function : callable
-        Raises nothing. It may close over compiled functions.
-    arguments : mapping of str to numba type
-        The parameters of the function. Their names and order are checked, because machine code
-        would read one argument as another. ``F64_PTR`` and ``I64_PTR`` are addresses, of which
-        ``numba.carray`` makes arrays.
-    name : str
-        Part of the symbol, readable in a profile.
-    parts : sequence of str, callable or None
-        Identify what the function closes over, see `key_of`. Its module is covered by itself.
-    needs : sequence of EntryPoint
-        What the function calls by symbol.
-    returns : numba type, optional
-        Of the result, if there is one.
+    The function raises nothing, and may close over compiled functions: ``parts`` identify these,
+    see `key_of`, as its module is covered by itself. ``needs`` are what it calls by symbol, and
+    ``name`` is the part of its own that is readable in a profile. Names and order of the
+    ``arguments``, with their numba types, are checked, because machine code would read one argument
+    as another; ``F64_PTR`` and ``I64_PTR`` are addresses, of which ``numba.carray`` makes arrays.
     """
 
     def __init__(
@@ -178,11 +167,8 @@ class EntryPoint:
     def compile(self) -> None:
         """Define the symbol in this process; load it from disk if it was compiled before.
 
-        Raises
-        ------
-        ModelError
-            If something that a user's function refers to is not what it was when this was made, or
-            numba cannot compile it.
+        Raises `ModelError` if something that a user's function refers to is not what it was when
+        this was made, or numba cannot compile it.
         """
         parts, _ = self._parts
         if self._key() != self.key:

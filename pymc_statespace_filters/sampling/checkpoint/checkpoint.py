@@ -28,26 +28,12 @@ _MAX_READABLE = 40  # characters of a name
 def open_checkpoint(path: str | os.PathLike, settings: Mapping[str, Any]) -> Iterator[RecordFile]:
     """Open a checkpoint, or begin one where there is none; its folder is locked for the block.
 
-    Parameters
-    ----------
-    path : str or path
-        The folder; it is made if it does not exist.
-    settings : mapping of str to JSON values
-        All that the draws depend on: arguments, and fingerprints of model and data.
-
-    Yields
-    ------
-    RecordFile
-        Keys are ``chain 0``, for example.
-
-    Raises
-    ------
-    DataMismatchError
-        If the checkpoint is of a run with other settings; the message names every field that
-        differs, with both values.
-    ModelError
-        If the folder cannot be used: it is a file, not writable, in use by another process, or its
-        checkpoint is damaged at its beginning or of another format.
+    The folder is made if it does not exist. ``settings``, in JSON values, are all that the draws
+    depend on: arguments, and fingerprints of model and data. Keys are ``chain 0``, for example.
+    Raises `DataMismatchError` if the checkpoint is of a run with other settings: the message names
+    every field that differs, with both values; `ModelError` if the folder cannot be used: it is a
+    file, not writable, in use by another process, or its checkpoint is damaged at its beginning or
+    of another format.
 
     Examples
     --------

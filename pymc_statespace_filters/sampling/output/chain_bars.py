@@ -38,20 +38,9 @@ class ChainProgress(ProgressBarManager):
     """Progress bars of several chains, each advanced by many iterations at once.
 
     A context manager that leaves the terminal as it was, however the block ends. To be used from
-    one thread.
-
-    Parameters
-    ----------
-    n_chains, draws, tune : int
-    progressbar : bool or str
-        As in ``pm.sample``: True, False, "combined", "split", "combined+stats", "split+stats".
-    has_rate : bool
-        Whether a fraction of accepted proposals is known.
-
-    Raises
-    ------
-    ValueError
-        If ``progressbar`` is something else; with the message of ``pm.sample``.
+    one thread. ``progressbar`` is as in ``pm.sample``, whose `ValueError` it raises if it is
+    something else: True, False, "combined", "split", "combined+stats" or "split+stats". A fraction
+    of accepted proposals is known if it ``has_rate``.
 
     Examples
     --------

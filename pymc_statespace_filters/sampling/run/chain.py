@@ -75,13 +75,7 @@ class Chain(ChainArrays):
 
         The last candidate is the point given by the user or the model; ``others`` are the values of
         variables that other step methods move. Returns 0 or the failure code of each evaluation.
-
-        Raises
-        ------
-        StopRequested
-            If a stop is requested meanwhile.
-        Exception
-            What the model raised.
+        Raises `StopRequested` if a stop is requested meanwhile, and what the model raised.
         """
         self._density.correlation[...] = 0.0
 

@@ -108,16 +108,8 @@ class RecordChain(ChainArrays):
 
         The shared parameters and the population are those of the candidate of highest density;
         every record takes its own from the candidate at which it is likeliest. Returns 0 or the
-        failure code of the evaluations of all records.
-
-        Raises
-        ------
-        StopRequested
-            If a stop is requested meanwhile.
-        ModelError
-            If the density of a record is zero at all candidates.
-        Exception
-            What the model raised.
+        failure code of the evaluations of all records. Raises as `Chain.start`, and `ModelError` if
+        the density of a record is zero at all candidates.
         """
         failures: list[int] = []
         layout = self._target.layout

@@ -175,10 +175,7 @@ class RunArguments:
     def request(self) -> SamplingRequest:
         """Check the arguments that need no model, and make a request of them.
 
-        Raises
-        ------
-        ModelError
-            If an argument is not as ``sample_dram`` describes it.
+        Raises `ModelError` if an argument is not as ``sample_dram`` describes it.
         """
         draws, tune = self.draws, self.tune
         check_count("draws", draws, 0, _MOST_ITERATIONS)
