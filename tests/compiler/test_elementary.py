@@ -1,6 +1,7 @@
 """The functions of vector loops: against 64-bit mantissas, and NumPy's answers at the edges."""
 
 import warnings
+from functools import cache
 
 import numpy as np
 import pymc as pm
@@ -62,6 +63,7 @@ NEEDS_LONG_DOUBLE = pytest.mark.skipif(
 )
 
 
+@cache
 def elementwise(name):
     """The function in a loop that is compiled as generated loops are."""
     function = (INLINED | {"sqrt": sqrt})[name]

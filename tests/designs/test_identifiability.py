@@ -23,6 +23,8 @@ from pymc_statespace_filters.designs.weak_directions import (
 )
 from pymc_statespace_filters.errors import DataMismatchError, ModelError
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 U = np.linspace(-1.0, 2.0, 40)[:, None]
 
 

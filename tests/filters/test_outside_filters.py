@@ -233,15 +233,10 @@ def returns_members(call):
 
 
 @njit(error_model="numpy")
-def returns_nan(call, j, k, parts):
-    return updated(np.nan)
-
-
-@njit(error_model="numpy")
-def raises_in_row_3(call, j, k, parts):
+def fails_in_row_3(call, j, k, parts):
     if j == 3 and call.record.theta[0] == 0.7:
         raise ValueError("a message")
-    return updated(-1.0)
+    return updated(np.nan if j == 3 and call.record.theta[0] == 0.9 else -1.0)
 
 
 def own(observe, **functions):
@@ -265,22 +260,25 @@ def test_what_is_no_such_function_is_refused_at_once(observe):
         own(observe)
 
 
-def test_an_increment_that_is_not_a_number_is_a_failure():
+@pytest.fixture(scope="module")
+def failing():
+    return own(fails_in_row_3)
+
+
+def test_an_increment_that_is_not_a_number_is_a_failure(failing):
     with pytest.warns(FilterWarning, match="gave -inf"):
-        terms = psf.log_likelihood(SYSTEM, own(returns_nan), {"a": 0.7}, **RUN)
-    assert np.isneginf(terms).all()
+        terms = psf.log_likelihood(SYSTEM, failing, {"a": 0.9}, **RUN)
+    np.testing.assert_array_equal(np.isneginf(terms), np.arange(5) > 2)
 
 
-def test_an_exception_is_a_failure_that_says_so(monkeypatch):
+def test_an_exception_is_a_failure_that_says_so(failing, monkeypatch):
     """From there on nothing is known, neither of this record of a panel nor of those behind it."""
     raised = []
     monkeypatch.setattr(sys, "unraisablehook", lambda one: raised.append(one.exc_type))
     panel, a = np.repeat([1, 2, 3], 5), np.array([0.2, 0.7, -0.4])
     given = {"steps": np.tile(RECORD_STEPS, 3), "inputs": FORCE, "panel": panel}
     with pytest.warns(FilterWarning, match="record 2, first in row 3, .* filter raised an exc"):
-        terms = psf.log_likelihood(
-            SYSTEM, own(raises_in_row_3), {"a": a}, np.tile(RECORD, (3, 1)), **given
-        )
+        terms = psf.log_likelihood(SYSTEM, failing, {"a": a}, np.tile(RECORD, (3, 1)), **given)
     np.testing.assert_array_equal(np.isneginf(terms), np.arange(15) > 7)
     assert set(raised) == {ValueError}
 

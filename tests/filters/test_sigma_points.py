@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 import pytensor.tensor as pt
 import pytest
-from numba import njit
 from scipy.stats import norm
 
 import pymc_statespace_filters as psf
@@ -71,14 +70,13 @@ class Evaluation(NamedTuple):
 @cache
 def both_passes(filter, system):
     """The function (theta, record, terms_bar) -> terms, health, tape and gradient."""
-    forward = kernel(TapedLogLikelihood(system, filter)).function
-    backward = kernel(TapePullback(system, filter)).function
+    forward = kernel(TapedLogLikelihood(system, filter))
+    backward = kernel(TapePullback(system, filter))
 
-    @njit
-    def run(theta, steps, observed, inputs, t0, seed, terms_bar):
-        terms, health, tape = forward(theta, steps, observed, inputs, t0, seed)
-        gradient = backward(theta, steps, observed, inputs, t0, seed, tape, terms_bar)
-        return terms, health, tape, gradient
+    def run(*given):
+        *record, terms_bar = given
+        terms, health, tape = forward(*record)
+        return terms, health, tape, backward(*record, tape, terms_bar)
 
     return run
 

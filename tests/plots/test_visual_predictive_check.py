@@ -12,6 +12,8 @@ from pymc_statespace_filters import plot_forecast
 from pymc_statespace_filters.errors import ModelError, ModelWarning
 from tests.plots.drawn import drawn
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 PERCENTILES = (5, 50, 95)
 OF_PREDICTIONS = {"group": "posterior_predictive", "backend": "none"}
 

@@ -19,6 +19,8 @@ from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.record import read_record
 from tests.modes import AS_IT_STANDS
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 OBSERVED = {"observation": lambda x: [x[0]], "observation_noise": [[0.1]]}
 
 

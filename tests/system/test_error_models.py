@@ -10,6 +10,8 @@ import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import ModelError
 from pymc_statespace_filters.pharmacometrics import log_normal_error, normal_error
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 AT = {"V": 4.0, "CL": 2.0, "a": 0.3, "b": 0.2, "c": 0.5}
 STATE, DATA = [8.0, -3.0], [2.4, -2.6]
 PREDICTED = np.array([2.0, -3.0])

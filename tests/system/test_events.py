@@ -14,6 +14,8 @@ from pymc_statespace_filters.system.given_record import GivenRecord
 from pymc_statespace_filters.system.input_columns import divided
 from pymc_statespace_filters.system.record import read_record
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 DECAY, VOLUME, SHARE, SD = 0.7, 2.0, 0.9, 0.1
 DOSES = {"time": [1.0, 1.77, 2.5], "dose": [10.0, 5.0, 3.0]}
 TIMES = np.array([0.5, 1.0, 2.05, 3.0])

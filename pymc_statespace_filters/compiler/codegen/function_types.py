@@ -1,16 +1,19 @@
 """Types of compiled functions and of the graphs they come from; compilation of their source."""
 
-from collections.abc import Mapping, Sequence
+import ctypes
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numba import types
 from pytensor.graph.basic import Variable
 
-from ..native.entry_point import EntryPoint, address_of, call_address
+from ..native.entry_point import EntryPoint
 from ..native.jit import FAST_MATH, linked, njit_generated
-from .arguments import MEMBER_ARGUMENTS
+from ..native.planned_function import address_of_array
+from .arguments import MEMBER_ARGUMENTS, PARAMETER_ARGUMENTS
 
 # Inputs that differ between the members of an ensemble.
 MEMBER_INPUTS = frozenset({"x", "z"})
@@ -45,15 +48,19 @@ class MemberFunction:
         return self.entry.key
 
     @cached_property
-    def function(self) -> Any:
-        """Call it with arrays, from Python or from compiled functions."""
-        values = dict.fromkeys(MEMBER_ARGUMENTS, "np.int64(0)") | {"t": "0.0"}
-        for name in (names := self.arguments.split(", ")):
-            values[_PLACES.get(name, name)] = f"{name} * 1.0" if name == "t" else name
-        values |= {"k": "np.int64(k)"} if "k" in names else {}
-        values |= {"width": "np.int64(Z.shape[1])"} if "Z" in names else {}
-        values["n_members"] = "np.int64(X.shape[1])"
-        return _jitted(self.entry, self.arguments, values)
+    def function(self) -> Callable[..., None]:
+        """Call it with arrays from Python, for which nothing more is compiled."""
+        call, names = _from_python(self.entry, MEMBER_ARGUMENTS), self.arguments.split(", ")
+
+        def function(*values: Any) -> None:
+            given = dict(zip(names, values, strict=True))
+            words = dict.fromkeys(MEMBER_ARGUMENTS, 0)
+            words |= {_PLACES.get(name, name): value for name, value in given.items()}
+            words["width"] = given["Z"].shape[1] if "Z" in given else 0
+            words["n_members"] = given["X"].shape[1]
+            call(*words.values())
+
+        return function
 
 
 @dataclass(frozen=True)
@@ -69,28 +76,37 @@ class ParameterFunction:
         return self.entry.key
 
     @cached_property
-    def function(self) -> Any:
-        """Call it with an array, from Python or from compiled functions; an array is returned."""
-        values = {"theta": "theta", "n_theta": "np.int64(theta.size)", "out": "out"}
-        before, after = f"out = np.empty({self.length})", "return out"
-        return _jitted(self.entry, "theta", values, before, after)
+    def function(self) -> Callable[[np.ndarray], np.ndarray]:
+        """Call it with an array from Python; an array is returned."""
+        call = _from_python(self.entry, PARAMETER_ARGUMENTS)
+
+        def function(theta: np.ndarray) -> np.ndarray:
+            out = np.empty(self.length)
+            call(theta, theta.size, out)
+            return out
+
+        return function
 
 
-def _jitted(entry: EntryPoint, arguments: str, values: Mapping[str, str], *around: str) -> Any:
-    """The function of these arguments that calls an entry point with these values."""
+_C_TYPES = {types.float64: ctypes.c_double, types.intp: ctypes.c_int64}  # others are addresses
+
+
+def _from_python(entry: EntryPoint, arguments: Mapping[str, Any]) -> Callable[..., None]:
+    """The entry point with these arguments, of which those that are addresses may be arrays."""
     entry.compile()
-    arrays = [name for name in arguments.split(", ") if name not in ("k", "t")]
-    before, after = around or ("", "")
-    lines = [
-        *(f"if not {name}.flags.c_contiguous: raise ValueError(message)" for name in arrays),
-        before, f"call_address(address_of(symbol), ({', '.join(values.values())}))", after,
-    ]  # fmt: skip
-    scope = {
-        "np": np, "address_of": address_of, "call_address": call_address, "symbol": entry.symbol,
-        "message": "arrays must be contiguous, in C order",
-    }  # fmt: skip
-    exec(f"def function({arguments}):\n" + "".join(f"    {line}\n" for line in lines), scope)
-    return jit(scope["function"])
+    kinds = [_C_TYPES.get(kind, ctypes.c_void_p) for kind in arguments.values()]
+    run = ctypes.CFUNCTYPE(None, *kinds)(entry.address)
+
+    def call(*values: Any) -> None:
+        run(*(_checked_address(v) if isinstance(v, np.ndarray) else v for v in values))
+
+    return call
+
+
+def _checked_address(values: np.ndarray) -> int:
+    if values.dtype != np.float64 or not values.flags.c_contiguous:
+        raise ValueError("arrays must be contiguous, in C order, of float64")
+    return address_of_array(values)
 
 
 @dataclass(frozen=True)

@@ -162,7 +162,7 @@ class PlannedFunction:
             if is_value:
                 words[place] = int(value)
                 continue
-            words[place] = _address(value)
+            words[place] = address_of_array(value)
             for word, length in zip(shape, value.shape, strict=True):
                 words[word] = length
         # A replacement is given only arguments that were checked.
@@ -174,7 +174,7 @@ class PlannedFunction:
         made = []
         for place, sizes in self._shapes:
             result = np.empty([self._size(words, s) if is_slot else s for s, is_slot in sizes])
-            words[_RESULTS + place] = _address(result)
+            words[_RESULTS + place] = address_of_array(result)
             made.append(result)
         return words, made
 
@@ -199,7 +199,7 @@ class PlannedFunction:
         return namespace["call"]
 
 
-def _address(values: np.ndarray) -> int:
+def address_of_array(values: np.ndarray) -> int:
     """The address of an array; `ndarray.ctypes` takes four times as long."""
     try:
         return addressof(_NOTHING.from_buffer(values))
