@@ -88,7 +88,10 @@ class ParameterFunction:
         return function
 
 
-_C_TYPES = {types.float64: ctypes.c_double, types.intp: ctypes.c_int64}  # others are addresses
+_C_TYPES: dict[Any, Any] = {
+    types.float64: ctypes.c_double,
+    types.intp: ctypes.c_int64,
+}  # others are addresses
 
 
 def _from_python(entry: EntryPoint, arguments: Mapping[str, Any]) -> Callable[..., None]:
