@@ -20,10 +20,10 @@ def quoted(names: Iterable[str]) -> str:
     return joined([repr(name) for name in names])
 
 
-def joined(parts: Iterable[str]) -> str:
+def joined(parts: Iterable[str], word: str = "and") -> str:
     """Join as in "a, b and c"."""
     *others, last = parts
-    return f"{', '.join(others)} and {last}" if others else last
+    return f"{', '.join(others)} {word} {last}" if others else last
 
 
 class SentenceTable(pd.DataFrame):

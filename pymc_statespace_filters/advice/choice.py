@@ -1,15 +1,15 @@
 """A filter that takes a system badly: it linearises a jump, repeats a run, or has no digits."""
 
-from collections.abc import Sequence
 from typing import Any
 
 from ..filters.catalog import OF_REGIMES, followers
 from ..filters.checks import NO_DIGITS, Choice
 from ..filters.ekf import EKF
 from ..filters.gaussian.base import GaussianFilterBase
-from ..filters.protocol import Filter, System
+from ..filters.protocol import System
 from ..filters.rbpf import RBPF
 from ..filters.written import short_form
+from ..tables import joined
 from .words import sentences
 
 
@@ -41,7 +41,7 @@ def jump_problem(system: System, filter: Any) -> str | None:
     if of_regimes and not isinstance(filter, OF_REGIMES):
         reason = "this system switches between regimes"
     better = of_regimes + exact
-    remedy = f"; use {_either(better)}" if better else ""
+    remedy = f"; use {joined(map(short_form, better), 'or')}" if better else ""
     return (
         f"{short_form(filter)}: {reason}, which no linearisation follows, and the log-likelihood "
         f"may be far off{remedy}."
@@ -69,9 +69,3 @@ def rounding_problem(system: System, filter: Any) -> str | None:
         "loses tenths of a nat and more. Give variances 1e8 times those of observation_noise, which"
         " say as little."
     )
-
-
-def _either(filters: Sequence[Filter]) -> str:
-    """The short forms of filters, the last after "or"."""
-    *others, last = map(short_form, filters)
-    return f"{', '.join(others)} or {last}" if others else last

@@ -1,6 +1,6 @@
 """What went wrong in single chains: they stand still, run away, fail, or are lower than others."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -12,6 +12,7 @@ from ..sampling.output.phase_statistics import PhaseStatistics
 from ..sampling.target.record_target import RecordTarget
 from ..sampling.target.sampled_model import Growth
 from ..statistics.lower_chains import LowerChain
+from ..tables import joined
 from .collapse import collapse_remedies
 from .words import sentences
 
@@ -205,13 +206,7 @@ def _of_chains(texts: Mapping[int, str]) -> str:
     if len(texts) == 1:
         return f"Chain {next(iter(texts))}: {first}"
     numbers = "" if len(set(texts.values())) == 1 else f" (The numbers are of chain {min(texts)}.)"
-    return f"Chains {listed(texts)}: {first}{numbers}"
-
-
-def listed(chains: Iterable[int]) -> str:
-    """Numbers of chains in words: 0, 2 and 3."""
-    *firsts, last = map(str, chains)
-    return f"{', '.join(firsts)} and {last}" if firsts else last
+    return f"Chains {joined(map(str, texts))}: {first}{numbers}"
 
 
 def _lower_text(lower: Sequence[LowerChain]) -> str:
@@ -220,8 +215,8 @@ def _lower_text(lower: Sequence[LowerChain]) -> str:
     else:
         nats = sorted(low.nats for low in lower)
         begin = (
-            f"Chains {listed(low.chain for low in lower)} stayed {nats[0]:.0f} to {nats[-1]:.0f} "
-            f"nats below chain {lower[0].highest} (median log-density)"
+            f"Chains {joined(str(low.chain) for low in lower)} stayed {nats[0]:.0f} to "
+            f"{nats[-1]:.0f} nats below chain {lower[0].highest} (median log-density)"
         )
         they, them = "they may", "them"
     return (

@@ -11,6 +11,7 @@ from scipy.stats import skew
 
 from ..checks.coverage import ALL_MODES
 from ..pymc_model.inspection import noisy_filters
+from ..tables import joined
 
 # A posterior reaches zero if at least this share of the draws is below a tenth of the mean, and if
 # logarithms have this skewness: -1.1 with the exponential distribution, -1.5 with the half-normal,
@@ -55,10 +56,10 @@ def reparametrise(names: Sequence[str], positions: Array, slowest: str) -> str:
     together = [j for j in np.argsort(-sizes, kind="stable") if sizes[j] > _TOGETHER]
     if len(together) < 2:
         return f"reparametrise {slowest}"
-    *firsts, last = [names[j] for j in sorted(together[:_MOST_NAMED])]
+    named = joined(names[j] for j in sorted(together[:_MOST_NAMED]))
     others = sizes[together[1:]]
     return (
-        f"fix one of {', '.join(firsts)} and {last}, which move together (correlations of "
+        f"fix one of {named}, which move together (correlations of "
         f"{others.min():.2f} to {others.max():.2f} with {slowest}), or write the others relative "
         "to it"
     )

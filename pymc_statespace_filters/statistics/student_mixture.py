@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from .importance import normalised
+from .importance import log_sum, normalised
 
 DEGREES_OF_FREEDOM = 5.0
 N_STEPS, MIN_STEP = 200, 1e-3  # EM iterations; smallest gain in nats per draw
@@ -36,15 +36,21 @@ class StudentMixture:
 
     def log_density(self, x: Array) -> Array:
         """Log-density at points x (m, k), shape (m,)."""
-        return _log_sum(self.log_joint(x))
+        return log_sum(self.log_joint(x), axis=0)
 
     def log_joint(self, x: Array) -> Array:
         """Log-density of each component times its weight at x (m, k), shape (J, m)."""
         nu, k = DEGREES_OF_FREEDOM, x.shape[-1]
+        tail = 0.5 * (nu + k) * np.log1p(self.squared_distances(x) / nu)
+        return self.log_factors[:, None] - tail
+
+    @property
+    def log_factors(self) -> Array:
+        """Log of the weight of each component times its density at its mean, (J,)."""
+        nu, k = DEGREES_OF_FREEDOM, self.means.shape[-1]
         log_det = np.log(np.diagonal(self.chols, axis1=1, axis2=2)).sum(axis=1)
         constant = gammaln((nu + k) / 2) - gammaln(nu / 2) - 0.5 * k * math.log(nu * math.pi)
-        tail = 0.5 * (nu + k) * np.log1p(self.squared_distances(x) / nu)
-        return (np.log(self.weights) - log_det)[:, None] + constant - tail
+        return np.asarray(np.log(self.weights) - log_det + constant)
 
     def squared_distances(self, x: Array) -> Array:
         """Squared Mahalanobis distances of x (m, k) from each component, shape (J, m)."""
@@ -200,19 +206,12 @@ def fit_mixture(x: Array, mixture: StudentMixture) -> StudentMixture:
     reached = -np.inf
     for _ in range(N_STEPS):
         log_joint = mixture.log_joint(x)
-        log_density = _log_sum(log_joint)
+        log_density = log_sum(log_joint, axis=0)
         if log_density.mean() < reached + MIN_STEP:
             break
         reached = log_density.mean()
         mixture = _m_step(mixture, x, np.exp(log_joint - log_density))
     return mixture
-
-
-def _log_sum(log_joint: Array) -> Array:
-    """Log of the sum over components (J, m); SciPy's takes longer than a fit."""
-    peak = np.maximum(log_joint.max(axis=0), np.finfo(np.float64).min)  # where all are zero
-    with np.errstate(divide="ignore"):
-        return np.asarray(peak + np.log(np.exp(log_joint - peak).sum(axis=0)))
 
 
 def _m_step(mixture: StudentMixture, x: Array, responsibilities: Array) -> StudentMixture:

@@ -17,7 +17,6 @@ from ..pymc_model.inspection import given_model
 from ..pymc_model.posterior_draws import check_one_model, posterior_group
 from ..sampling import sample
 from ..system.checks import check_random_seed
-from .averaged_draws import averaged
 from .candidates import read_candidates
 from .doubts import check_distinct, check_finite, doubts, doubts_of_potentials
 from .enumeration import estimate_all, probabilities, until_certain, with_lighter_tails
@@ -28,7 +27,7 @@ from .proposals import Guide
 from .submodel_chains import MOST_MENDED, run_chains
 from .submodel_density import SubmodelDensity
 from .submodel_evidence import Sampler
-from .terms_tree import as_datatree
+from .terms_tree import as_datatree, averaged
 
 
 @shared_by_ranks

@@ -7,15 +7,12 @@ that they and the random walk have made for each evaluation, so that a mixture t
 costs little.
 """
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln
 
 from ...statistics.student_mixture import (
-    DEGREES_OF_FREEDOM,
     StudentMixture,
     fit_mixture,
     likeliest_mixture,
@@ -140,14 +137,11 @@ def _likeliest(parts: Sequence[Array], rng: np.random.Generator) -> StudentMixtu
 
 def _packed(mixture: StudentMixture) -> Array:
     n, dim = mixture.means.shape
-    log_det = np.log(np.diagonal(mixture.chols, axis1=1, axis2=2)).sum(axis=1)
-    nu = DEGREES_OF_FREEDOM
-    constant = gammaln((nu + dim) / 2) - gammaln(nu / 2) - 0.5 * dim * math.log(nu * math.pi)
     packed = no_mixture(dim)
     numbers, components = unpack_mixture(packed, dim)
     numbers[SHARE], numbers[N_COMPONENTS] = FIRST_SHARE, n
     components[:n, CUMULATIVE] = np.cumsum(mixture.weights)
-    components[:n, LOG_FACTOR] = np.log(mixture.weights) - log_det + constant
+    components[:n, LOG_FACTOR] = mixture.log_factors
     components[:n, MEAN : MEAN + dim] = mixture.means
     components[:n, MEAN + dim :] = mixture.chols.reshape(n, -1)
     return packed
