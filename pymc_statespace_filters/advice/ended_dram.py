@@ -8,6 +8,7 @@ from ..sampling.output.datatree import most_iterations
 from ..sampling.output.facts import EndedDram, WithoutDraws
 from .collapse import collapse_remedies
 from .filter_check import filters_of
+from .mirrors import of_one_image
 from .missed import missed_of
 from .mixing import mixing_problem, until_ess_problem
 from .mobility import GROWTH, LOWER, STANDSTILL, chain_problems
@@ -22,8 +23,10 @@ def _(fact: EndedDram, begin: str) -> list[str]:
     of_chains = chain_problems(fact)
     said = [*of_chains.values(), *_noise(fact)]
     is_looked_at = fact.options.compute_convergence_checks and "posterior" in fact.tree
+    alike = fact
     if is_looked_at and GROWTH not in of_chains:  # draws that mean nothing lack nothing
-        said += missed_of(fact)
+        missed, alike = missed_of(fact)
+        said += missed
     check = filters_of(fact)
     # An estimate may be far too high by chance: the level says nothing of one with noise.
     if fact.below is not None and not fact.target.seed_names:
@@ -33,7 +36,7 @@ def _(fact: EndedDram, begin: str) -> list[str]:
             "has found. Tune longer, or start there (initvals=psf.find_starts())."
         )
     elif fact.chains and of_chains.keys().isdisjoint({STANDSTILL, LOWER, GROWTH}):
-        said += _mixing(fact)
+        said += _mixing(fact) if alike is fact else of_one_image(_mixing(alike))
     said += _left_out(fact)
     report = closing_report(fact) if fact.chains else ""
     problems = said or check.warned or is_interrupted() or have_missing_codes(fact.model)

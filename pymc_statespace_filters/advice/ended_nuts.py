@@ -10,6 +10,7 @@ from ..pymc_model.inspection import have_missing_codes
 from ..sampling.output.convergence import MAX_RHAT
 from ..sampling.output.facts import EndedNuts
 from .filter_check import filters_of
+from .mirrors import of_one_image
 from .missed import missed_of
 from .mixing import mixing_problem, until_ess_problem
 from .remedies import alternatives, reaches_zero, reparametrise, without_transform
@@ -25,11 +26,13 @@ _BY_CHANCE, _LEAST_SHIFT = 0.05, 0.5
 
 @told.register
 def _(fact: EndedNuts, begin: str) -> list[str]:
-    missed = missed_of(fact)
+    missed, alike = missed_of(fact)
     check = filters_of(fact)
     bounded = reaches_zero(fact.model, fact.names, fact.positions)
     instead = "" if bounded is None else without_transform(bounded)
-    said = [*_problems(fact, instead), *missed, *_too_short(fact, instead)]
+    too_short = _too_short(alike, instead)
+    too_short = too_short if alike is fact else of_one_image(too_short)
+    said = [*_problems(fact, instead), *missed, *too_short]
     report = _report(fact)
     is_good = fact.convergence is not None and fact.convergence.rhat.max() <= MAX_RHAT
     if is_good and not (said or is_interrupted() or have_missing_codes(fact.model)):

@@ -1,5 +1,8 @@
 """What chains have missed of the posterior: a search at their end, in a small part of its time."""
 
+from collections.abc import Sequence
+from functools import cache, partial
+
 import numpy as np
 
 from ..checks.coverage.check import MOST_PARAMETERS
@@ -8,6 +11,7 @@ from ..evidence.evidence_facts import PartsOfPosterior
 from ..parallel.shared_rows import by_first_rank
 from ..parallel.signals import unless_interrupted
 from ..pymc_model.density import ModelDensity
+from ..pymc_model.inspection import noise_seeds
 from ..pymc_model.posterior_draws import (
     MIN_DRAWS,
     STEP_CHECK,
@@ -17,7 +21,8 @@ from ..pymc_model.posterior_draws import (
 )
 from ..sampling.output.facts import EndedRun
 from ..sampling.target.target import Target
-from .signs import signs_message, with_both_signs
+from .mirrors import in_one_image, mirror_sentence, mirrors_within
+from .signs import signs_message
 from .step_check import step_problems
 from .words import sentences
 
@@ -42,53 +47,65 @@ def _(fact: PartsOfPosterior) -> list[str]:
     return by_first_rank(lambda: unvisited(fact.model, *parts, _LEAST_SECONDS, fact.rng))
 
 
-def missed_of(fact: EndedRun) -> list[str]:
+def missed_of[Run: EndedRun](fact: Run) -> tuple[list[str], Run]:
     """Say what the draws lack, and whether their integration steps are too long.
 
-    Both are stored with the draws.
+    Both are stored with the draws. And the run with all draws in one of the mirror images that
+    they are in, if they are: the same one if not.
     """
-    nothing: list[str] = []
+    nothing: tuple[list[str], Run] = [], fact
     if fact.tree["posterior"].sizes["draw"] < MIN_DRAWS:
         return nothing
-    missed = unless_interrupted(lambda: _missed_parts(fact), nothing)
-    steps = unless_interrupted(lambda: step_problems(fact.tree, fact.model), nothing)
+    missed, alike = unless_interrupted(lambda: _missed_parts(fact), nothing)
+    steps = unless_interrupted(lambda: step_problems(fact.tree, fact.model), list[str]())
     if steps:
         fact.tree.attrs[STEP_CHECK] = " ".join(steps)
-    return [*missed, *steps]
+    return [*missed, *steps], alike
 
 
-def _missed_parts(fact: EndedRun) -> list[str]:
-    """Say which modes and tails of the posterior the draws lack, or that a sign has no meaning.
+def _missed_parts[Run: EndedRun](fact: Run) -> tuple[list[str], Run]:
+    """Say which modes and tails of the posterior the draws lack, or that signs have no meaning.
 
-    The outcome is stored with the draws. Chains that held one noise seed are not checked.
+    The outcome is stored with the draws. Chains that held one noise seed are not checked. What is
+    found in mirror images is nothing else.
     """
     tree, model, prior = fact.tree, fact.model, fact.target.prior_draws
     stats = tree["sample_stats"]
     seeded = [name for name in stats.data_vars if str(name).endswith("_seed")]
     if "lp" not in stats or (seeded and not tree.attrs["refresh_noise"]):
-        return []
+        return [], fact
     draws = unconstrained_draws(tree, model)
-    if draws.shape[-1] > MOST_PARAMETERS:
-        return []
     flat = draws.reshape(-1, draws.shape[-1])
-    is_enough = len(flat) >= _LEAST_DRAWS
-    if not (is_enough or with_both_signs(model, flat)):
-        return []
-    density: Target | ModelDensity
-    if isinstance(fact.target, Target) and fact.target.evaluates_alone:
-        density = fact.target
-    else:
-        density = ModelDensity(model, moved=noise_was_moved(tree))
+    seconds = max(_LEAST_SECONDS, _SHARE * fact.seconds)
+    density = cache(partial(_density, fact))
+
+    def evaluate(x: np.ndarray) -> np.ndarray:
+        return density().evaluate_afresh(x, fact.rngs[0])
+
+    is_exact = not noise_seeds(model)
     found: list[str] = []
-    if is_enough:
-        log_density = stats["lp"].transpose("chain", "draw").values.astype(np.float64)
-        seconds = max(_LEAST_SECONDS, _SHARE * fact.seconds)
-        wide = prior.draws if prior.is_prior and len(prior.draws) > 1 else None
-        found = unvisited(
-            model, draws, log_density, density.evaluate_afresh, seconds, fact.rngs[0], wide
-        )
+    if is_exact and (mirrors := mirrors_within(seconds, model, draws, evaluate)):
+        found = [mirror_sentence(model, mirror) for mirror in mirrors]
         store(tree, found)
-    if not density.seed_names:
-        sign = signs_message(model, flat, lambda x: density.evaluate_afresh(x, fact.rngs[0]))
-        found = found if sign is None else [sign, *found]
-    return [f"{text[0].upper()}{text[1:]}." for text in found]
+        return _as_sentences(found), in_one_image(fact, mirrors)
+    if draws.shape[-1] > MOST_PARAMETERS:
+        return [], fact
+    if len(flat) >= _LEAST_DRAWS:
+        log_density = stats["lp"].transpose("chain", "draw").values.astype(np.float64)
+        wide = prior.draws if prior.is_prior and len(prior.draws) > 1 else None
+        evaluate_afresh = density().evaluate_afresh
+        found = unvisited(model, draws, log_density, evaluate_afresh, seconds, fact.rngs[0], wide)
+        store(tree, found)
+    if is_exact and (sign := signs_message(model, flat, evaluate)) is not None:
+        found = [sign, *found]
+    return _as_sentences(found), fact
+
+
+def _density(fact: EndedRun) -> Target | ModelDensity:
+    if isinstance(fact.target, Target) and fact.target.evaluates_alone:
+        return fact.target
+    return ModelDensity(fact.model, moved=noise_was_moved(fact.tree))
+
+
+def _as_sentences(texts: Sequence[str]) -> list[str]:
+    return [f"{text[0].upper()}{text[1:]}." for text in texts]

@@ -1,6 +1,7 @@
 """Separate modes among the points of a search: where they are, and whether labels change places."""
 
 from collections.abc import Mapping, Sequence
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,15 +10,18 @@ from pymc.model import Model
 from ..checks.coverage import ALL_MODES
 from ..pymc_model.at_points import ConstrainedValues
 from ..pymc_model.density import ModelDensity
+from ..pymc_model.inspection import noise_seeds
 from ..sampling.output.facts import SeparateModes
 from ..sampling.starts.modes import is_reordered
 from ..sampling.target.variables import RaveledVariables
+from .mirrors import mirrors_within
 from .signs import is_symmetric, with_both_signs
 from .words import sentences
 
 _LEAST_SHARE = 0.02  # of the points; fewer have only not moved yet
 _APART = 2.0  # standard deviations within the modes: variables that differ between them
 _MOST_NAMED = 4  # variables in the message
+_SECONDS = 1.0  # of a processor, to find mirror images
 _N_COMPARED = 50  # points of each mode, whose means are compared
 
 _LABELS = (
@@ -59,22 +63,22 @@ def _(fact: SeparateModes) -> list[str]:
 
 
 def _are_mirrored(model: Model, modes: Sequence[Array]) -> bool:
-    """Whether the modes are one, at both signs of scales whose sign has no meaning."""
-    x = np.concatenate(modes)
-    candidates = with_both_signs(model, x)
-    density = ModelDensity(model) if candidates else None
-    if density is None or density.seed_names:
+    """Whether the modes are one, at both signs of elements whose signs have no meaning."""
+    if noise_seeds(model):
         return False
+    x, density = np.concatenate(modes), cache(partial(ModelDensity, model))
 
     def evaluate(at: Array) -> Array:
-        return density.evaluate(at, np.zeros((len(at), 0), dtype=np.int64))
+        return density().evaluate(at)
 
-    folded = [mode.copy() for mode in modes]
-    for i in candidates:
+    folded = x.copy()
+    for i in with_both_signs(model, x):
         if is_symmetric(x, i, evaluate):
-            for mode in folded:
-                mode[:, i] = abs(mode[:, i])
-    means, sds = (np.array([f(mode, axis=0) for mode in folded]) for f in (np.mean, np.std))
+            folded[:, i] = abs(folded[:, i])
+    for mirror in mirrors_within(_SECONDS, model, folded[np.newaxis], evaluate)[-1:]:
+        folded = mirror.folded[0]
+    parts = np.split(folded, np.cumsum([len(mode) for mode in modes])[:-1])
+    means, sds = (np.array([f(mode, axis=0) for mode in parts]) for f in (np.mean, np.std))
     return bool((np.ptp(means, axis=0) <= _APART * sds.max(axis=0)).all())
 
 

@@ -24,14 +24,17 @@ def signs_message(model: Model, draws: Array, evaluate: Callable[[Array], Array]
     """
     for i in with_both_signs(model, draws):
         if is_symmetric(draws, i, evaluate):
-            name = Elements.of(model).labels[i]
-            share = (draws[:, i] < 0).mean()
-            return (
-                f"the density is the same at {name} and -{name}, and {share:.0%} of the draws are "
-                f"negative, so that the mean and the intervals of {name} say nothing of its size. "
-                f"If {name} is a scale, give it a positive prior, such as pm.HalfNormal"
-            )
+            return sign_text(Elements.of(model).labels[i], float((draws[:, i] < 0).mean()))
     return None
+
+
+def sign_text(name: str, share: float) -> str:
+    """Say that a sign has no meaning, which is negative in this share of the draws."""
+    return (
+        f"the density is the same at {name} and -{name}, and {share:.0%} of the draws are "
+        f"negative, so that the mean and the intervals of {name} say nothing of its size. "
+        f"If {name} is a scale, give it a positive prior, such as pm.HalfNormal"
+    )
 
 
 def with_both_signs(model: Model, draws: Array) -> list[int]:

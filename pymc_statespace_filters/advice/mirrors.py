@@ -1,0 +1,88 @@
+"""Mirror images of a posterior: which signs turn together, which chains are where, what helps."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pymc.model import Model
+
+from ..checks.coverage.mirrors import Density, Mirror, mirrors_of
+from ..pymc_model.at_points import ConstrainedValues
+from ..pymc_model.elements import Elements, places_in_vector
+from ..sampling.output.convergence import convergence
+from ..sampling.output.facts import EndedRun
+from .mobility import listed
+from .signs import sign_text
+
+_MOST_NAMED = 6  # elements
+_ALL = 0.95  # of the draws of a chain, that is said to be in an image
+
+Array = NDArray[np.float64]
+
+
+def mirrors_within(seconds: float, model: Model, draws: Array, evaluate: Density) -> list[Mirror]:
+    """The mirrors of draws (chain, draw, k), if the search takes no more CPU seconds."""
+    end = time.process_time() + seconds
+
+    def in_time(x: Array) -> Array:
+        if time.process_time() > end:
+            raise TimeoutError
+        return evaluate(x)
+
+    try:
+        return mirrors_of(draws, _have_signs(model, draws[0, -1]), in_time)
+    except TimeoutError:
+        return []
+
+
+def _have_signs(model: Model, x: Array) -> NDArray[np.bool_]:
+    """The elements (k,) whose sign on the unconstrained space is that of the parameter."""
+    at, have_signs = ConstrainedValues(model), np.zeros(len(x), dtype=bool)
+    values, opposite = at(x), at(-x)
+    for name, columns in places_in_vector(model).items():
+        if columns.size == values[name].size:
+            have_signs[columns] = np.isclose(values[name], -opposite[name], rtol=1e-9, atol=0.0)
+    return have_signs
+
+
+def mirror_sentence(model: Model, mirror: Mirror) -> str:
+    """Say where the chains are, which signs turn, and which prior keeps one image."""
+    names, share = Elements.of(model).labels, mirror.share
+    first, *others = turned = [names[i] for i in mirror.turned]
+    if mirror.is_split and not others:
+        return sign_text(first, float(share.mean()))
+    where, so = "all chains are in one of", "means, intervals and the evidence lack the other"
+    here, there = (np.flatnonzero(of > _ALL) for of in (1 - share, share))
+    if mirror.is_split:
+        where, so = "the chains pass between", "means say nothing, and longer chains do not help"
+        if len(here) + len(there) == len(share):
+            where = f"chains {listed(here)} are in one and {listed(there)} in the other of"
+    if len(turned) > _MOST_NAMED:
+        turned[_MOST_NAMED:] = [f"{len(turned) - _MOST_NAMED} others"]
+    signs = f"signs of {listed(turned)} turned together" if others else f"sign of {first} turned"
+    prior = "pm.HalfNormal"
+    if first.endswith("]"):
+        prior = (
+            "in a vector pm.TruncatedNormal with lower=0 for it and -np.inf for the others, and "
+            "default_transform=None"
+        )
+    return (
+        f"{where} two mirror images of the posterior: its density is the same with the {signs}, so "
+        f"that {so}; give {first}, which is clear of zero, a prior of one sign ({prior})"
+    )
+
+
+def in_one_image[Run: EndedRun](fact: Run, mirrors: Sequence[Mirror]) -> Run:
+    """A run as it would be with all draws in one image, if they are not."""
+    if fact.convergence is None or not any(mirror.is_split for mirror in mirrors):
+        return fact
+    folded = mirrors[-1].folded
+    positions = folded.reshape(-1, folded.shape[-1])
+    return replace(fact, convergence=convergence(list(folded)), positions=positions)
+
+
+def of_one_image(texts: Sequence[str]) -> list[str]:
+    """What is said of such a run."""
+    return [f"In one image, {text[0].lower()}{text[1:]}" for text in texts]

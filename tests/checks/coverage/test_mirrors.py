@@ -1,0 +1,118 @@
+"""Mirror images are found with all signs that turn, and no other posterior has any."""
+
+import numpy as np
+import pytest
+
+from pymc_statespace_filters.checks.coverage.mirrors import mirrors_of
+
+K, CHAINS, N = 40, 4, 500
+RNG = np.random.default_rng(1)
+TURNED = np.sort(RNG.choice(K, 17, replace=False))
+WEIGHTS = RNG.normal(size=(3, K, 60))
+
+
+class Hidden:
+    """A density of 60 numbers, each with elements that do not turn and products of two that do.
+
+    ``evaluated`` counts the points; a ``tilt`` makes one of two images lower.
+    """
+
+    def __init__(self, centre, tilt=0.0):
+        self.is_turned, self.tilt, self.evaluated = np.isin(np.arange(K), TURNED), tilt, 0
+        self.data = self.numbers(centre)
+
+    def numbers(self, x):
+        odd, even = np.where(self.is_turned, x, 0.0), np.where(self.is_turned, 0.0, x)
+        return (odd @ WEIGHTS[0]) * (odd @ WEIGHTS[1]) + even @ WEIGHTS[2]
+
+    def __call__(self, x):
+        self.evaluated += len(x)
+        squares = ((self.numbers(x) - self.data) ** 2).sum(-1) + (x**2).sum(-1)
+        return -0.5 * squares + self.tilt * np.tanh(x[:, TURNED[0]])
+
+
+def draws_of(centre, width=0.1, sides=(1, 1, -1, 1)):
+    """Chains around a centre, and around its mirror image where the side is -1."""
+    x = centre + width * np.random.default_rng(2).normal(size=(CHAINS, N, K))
+    signs = np.where(np.isin(np.arange(K), TURNED), -1.0, 1.0)
+    return np.stack([x[i] * (signs if side < 0 else 1.0) for i, side in enumerate(sides)])
+
+
+CENTRE = np.random.default_rng(3).normal(size=K)
+ALL = np.ones(K, dtype=bool)
+
+
+@pytest.mark.parametrize("sides", [(1, 1, -1, 1), (1, 1, 1, 1), (-1, -1, -1, -1)])
+def test_all_signs_are_found_from_chains_in_both_images_or_in_one(sides):
+    """Though half of the elements are near zero, with draws of either sign."""
+    centre = CENTRE.copy()
+    centre[::2] *= 0.01
+    target, draws = Hidden(centre), draws_of(centre, sides=sides)
+    (found,) = mirrors_of(draws, ALL, target)
+    np.testing.assert_array_equal(np.sort(found.turned), TURNED)
+    assert found.is_split == (len(set(sides)) > 1)
+    first = found.turned[0]
+    np.testing.assert_array_equal(found.share, draws[:, 0, first] < 0)
+    side = 1 if centre[first] > 0 else -1
+    np.testing.assert_array_equal(found.folded, draws_of(centre, sides=[side] * CHAINS))
+    assert target.evaluated < 30 * K
+
+
+def test_images_of_different_heights_are_none():
+    """By so little as a thousandth of a nat."""
+    assert len(mirrors_of(draws_of(CENTRE), ALL, Hidden(CENTRE))) == 1
+    assert mirrors_of(draws_of(CENTRE), ALL, Hidden(CENTRE, tilt=1e-3)) == []
+
+
+def test_a_sign_that_may_not_turn_ends_the_search():
+    """As that of a logarithm."""
+    for i in TURNED:
+        assert mirrors_of(draws_of(CENTRE), np.arange(K) != i, Hidden(CENTRE)) == []
+
+
+def ridge(x):
+    """Normal priors, and a sum of two elements that is known to be zero."""
+    return -0.5 * (x**2).sum(-1) - 0.5 * ((x[:, 0] + x[:, 1]) / 0.01) ** 2
+
+
+def normal(x):
+    return -0.5 * (x**2).sum(-1)
+
+
+@pytest.mark.parametrize(
+    ("target", "centre"),
+    [(ridge, [1.0, -1.0, 0.2]), (normal, [1.5, 0.5, 0.0])],
+)
+def test_one_symmetric_mode_has_no_image(target, centre):
+    """Though chains are too short to leave the side that each is on."""
+    centre = np.array(centre)
+    z = 0.01 * np.random.default_rng(4).normal(size=(CHAINS, N, 3))
+    sides = np.array([1.0, -1.0, 1.0, -1.0])[:, np.newaxis, np.newaxis]
+    assert mirrors_of(sides * (centre + z), np.ones(3, dtype=bool), target) == []
+
+
+def test_several_mirrors_at_once():
+    """Of two hidden states, with two elements each, and of a product of three elements."""
+
+    def two(x):
+        return -50 * ((x[:, 0] * x[:, 2] - 1) ** 2 + (x[:, 1] * x[:, 3] - 1) ** 2) + normal(x)
+
+    def triple(x):
+        return -50 * (x[:, 0] * x[:, 1] * x[:, 2] - 1) ** 2 - 0.05 * (x**2).sum(-1)
+
+    z = 0.05 * np.random.default_rng(5).normal(size=(CHAINS, N, 4))
+    z += 1 + 0.1 * np.arange(4)
+    z[1, :, [0, 2]] *= -1
+    z[2, :, [1, 3]] *= -1
+    z[3] *= -1
+    found = mirrors_of(z, np.ones(4, dtype=bool), two)
+    assert sorted(sorted(mirror.turned.tolist()) for mirror in found) == [[0, 2], [1, 3]]
+    assert (found[-1].folded > 0).all()
+    x = 1 + 0.1 * np.arange(3) + 0.02 * np.random.default_rng(6).normal(size=(CHAINS, N, 3))
+    x[1, :, :2] *= -1
+    x[2, :, 1:] *= -1
+    found = mirrors_of(x, np.ones(3, dtype=bool), triple)
+    assert len(found) == 2
+    assert (found[-1].folded > 0).all() or (
+        np.sign(found[-1].folded) == np.sign(found[-1].folded[0, 0])
+    ).all()
