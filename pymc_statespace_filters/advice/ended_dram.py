@@ -36,7 +36,7 @@ def _(fact: EndedDram, begin: str) -> list[str]:
             "has found. Tune longer, or start there (initvals=psf.find_starts())."
         )
     elif fact.chains and of_chains.keys().isdisjoint({STANDSTILL, LOWER, GROWTH}):
-        said += _mixing(fact) if alike is fact else of_one_image(_mixing(alike))
+        said += of_one_image(_mixing(alike), alike is not fact)
     said += _left_out(fact)
     report = closing_report(fact) if fact.chains else ""
     problems = said or check.warned or is_interrupted() or have_missing_codes(fact.model)

@@ -30,8 +30,7 @@ def _(fact: EndedNuts, begin: str) -> list[str]:
     check = filters_of(fact)
     bounded = reaches_zero(fact.model, fact.names, fact.positions)
     instead = "" if bounded is None else without_transform(bounded)
-    too_short = _too_short(alike, instead)
-    too_short = too_short if alike is fact else of_one_image(too_short)
+    too_short = of_one_image(_too_short(alike, instead), alike is not fact)
     said = [*_problems(fact, instead), *missed, *too_short]
     report = _report(fact)
     is_good = fact.convergence is not None and fact.convergence.rhat.max() <= MAX_RHAT

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -23,18 +24,18 @@ Array = NDArray[np.float64]
 
 
 def mirrors_within(seconds: float, model: Model, draws: Array, evaluate: Density) -> list[Mirror]:
-    """The mirrors of draws (chain, draw, k), if the search takes no more CPU seconds."""
-    end = time.process_time() + seconds
+    """The mirrors of draws (chain, draw, k) that are found in so many CPU seconds."""
+    end, found = time.process_time() + seconds, list[Mirror]()
 
     def in_time(x: Array) -> Array:
         if time.process_time() > end:
             raise TimeoutError
         return evaluate(x)
 
-    try:
-        return mirrors_of(draws, _have_signs(model, draws[0, -1]), in_time)
-    except TimeoutError:
-        return []
+    with suppress(TimeoutError):
+        for mirror in mirrors_of(draws, _have_signs(model, draws[0, -1]), in_time):
+            found.append(mirror)
+    return found
 
 
 def _have_signs(model: Model, x: Array) -> NDArray[np.bool_]:
@@ -83,6 +84,6 @@ def in_one_image[Run: EndedRun](fact: Run, mirrors: Sequence[Mirror]) -> Run:
     return replace(fact, convergence=convergence(list(folded)), positions=positions)
 
 
-def of_one_image(texts: Sequence[str]) -> list[str]:
+def of_one_image(texts: Sequence[str], is_split: bool) -> list[str]:
     """What is said of such a run."""
-    return [f"In one image, {text[0].lower()}{text[1:]}" for text in texts]
+    return [f"In one image, {t[0].lower()}{t[1:]}" for t in texts] if is_split else list(texts)

@@ -1,6 +1,5 @@
 """What chains have missed of the posterior: a search at their end, in a small part of its time."""
 
-from collections.abc import Sequence
 from functools import cache, partial
 
 import numpy as np
@@ -28,6 +27,7 @@ from .words import sentences
 
 # CPU seconds: so many, or this share of the time of the run if that is more.
 _LEAST_SECONDS, _SHARE = 1.0, 0.1
+_MOST_MIRRORS = 3  # that are told; with the advice on these the next run tells others
 # Fewer draws in all know too little of their tails.
 _LEAST_DRAWS = 4000
 
@@ -60,7 +60,7 @@ def missed_of[Run: EndedRun](fact: Run) -> tuple[list[str], Run]:
     steps = unless_interrupted(lambda: step_problems(fact.tree, fact.model), list[str]())
     if steps:
         fact.tree.attrs[STEP_CHECK] = " ".join(steps)
-    return [*missed, *steps], alike
+    return [*(f"{text[0].upper()}{text[1:]}." for text in missed), *steps], alike
 
 
 def _missed_parts[Run: EndedRun](fact: Run) -> tuple[list[str], Run]:
@@ -85,9 +85,9 @@ def _missed_parts[Run: EndedRun](fact: Run) -> tuple[list[str], Run]:
     is_exact = not noise_seeds(model)
     found: list[str] = []
     if is_exact and (mirrors := mirrors_within(seconds, model, draws, evaluate)):
-        found = [mirror_sentence(model, mirror) for mirror in mirrors]
+        found = [mirror_sentence(model, mirror) for mirror in mirrors[:_MOST_MIRRORS]]
         store(tree, found)
-        return _as_sentences(found), in_one_image(fact, mirrors)
+        return found, in_one_image(fact, mirrors)
     if draws.shape[-1] > MOST_PARAMETERS:
         return [], fact
     if len(flat) >= _LEAST_DRAWS:
@@ -98,14 +98,10 @@ def _missed_parts[Run: EndedRun](fact: Run) -> tuple[list[str], Run]:
         store(tree, found)
     if is_exact and (sign := signs_message(model, flat, evaluate)) is not None:
         found = [sign, *found]
-    return _as_sentences(found), fact
+    return found, fact
 
 
 def _density(fact: EndedRun) -> Target | ModelDensity:
     if isinstance(fact.target, Target) and fact.target.evaluates_alone:
         return fact.target
     return ModelDensity(fact.model, moved=noise_was_moved(fact.tree))
-
-
-def _as_sentences(texts: Sequence[str]) -> list[str]:
-    return [f"{text[0].upper()}{text[1:]}." for text in texts]

@@ -6,7 +6,7 @@ point is its own image, and the density tells of any one of them, beside those w
 known, whether it turns with these. So all signs follow from that of a first element.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -37,17 +37,16 @@ class Mirror(NamedTuple):
         return bool(SIDE < self.share.mean() < 1 - SIDE)
 
 
-def mirrors_of(draws: Array, symmetric: NDArray[np.bool_], evaluate: Density) -> list[Mirror]:
+def mirrors_of(draws: Array, symmetric: NDArray[np.bool_], evaluate: Density) -> Iterator[Mirror]:
     """The mirrors of a posterior with draws (chain, draw, k); signs of ``symmetric`` (k,) may turn.
 
     One of the elements that turn has to stay away from zero.
     """
-    found, sizes = list[Mirror](), np.abs(draws).reshape(-1, draws.shape[-1])
+    found, sizes = set[int](), np.abs(draws).reshape(-1, draws.shape[-1])
     clear = np.quantile(sizes, LEAST, axis=0) / np.maximum(np.median(sizes, axis=0), 1e-300)
     x = draws.reshape(sizes.shape)[np.linspace(0, len(sizes) - 1, N_PROVED).astype(int)]
     for first in np.argsort(-clear):
-        is_known = any(first in mirror.turned for mirror in found)
-        if is_known or not symmetric[first] or clear[first] < APART:
+        if first in found or not symmetric[first] or clear[first] < APART:
             continue
         signs = _signs(x[:: N_PROVED // N_FOUND], first, symmetric, evaluate)
         if signs is None or not _are_same(evaluate(signs * x), at_x := evaluate(x)).all():
@@ -59,9 +58,9 @@ def mirrors_of(draws: Array, symmetric: NDArray[np.bool_], evaluate: Density) ->
         if (evaluate(np.where(signs < 0, 0.0, ends)) < evaluate(ends) - DIP).any():
             turned = np.flatnonzero(signs < 0)
             turned = turned[np.argsort(-clear[turned], kind="stable")]
-            found.append(Mirror(turned, is_image.mean(axis=1), folded))
+            yield Mirror(turned, is_image.mean(axis=1), folded)
+            found.update(turned.tolist())
             draws, symmetric = folded, symmetric & (np.arange(len(symmetric)) != first)
-    return found
 
 
 def _signs(x: Array, first: int, symmetric: NDArray[np.bool_], evaluate: Density) -> Array | None:
