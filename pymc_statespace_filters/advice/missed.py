@@ -1,6 +1,6 @@
 """What chains have missed of the posterior: a search at their end, in a small part of its time."""
 
-from functools import cache, partial
+from functools import cache
 
 import numpy as np
 
@@ -77,7 +77,7 @@ def _missed_parts[Run: EndedRun](fact: Run) -> tuple[list[str], Run]:
     draws = unconstrained_draws(tree, model)
     flat = draws.reshape(-1, draws.shape[-1])
     seconds = max(_LEAST_SECONDS, _SHARE * fact.seconds)
-    density = cache(partial(_density, fact))
+    density = cache(lambda: _density(fact))
 
     def evaluate(x: np.ndarray) -> np.ndarray:
         return density().evaluate_afresh(x, fact.rngs[0])

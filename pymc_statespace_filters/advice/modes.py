@@ -1,7 +1,6 @@
 """Separate modes among the points of a search: where they are, and whether labels change places."""
 
 from collections.abc import Mapping, Sequence
-from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,6 @@ from ..sampling.output.facts import SeparateModes
 from ..sampling.starts.modes import is_reordered
 from ..sampling.target.variables import RaveledVariables
 from .mirrors import mirrors_within
-from .signs import is_symmetric, with_both_signs
 from .words import sentences
 
 _LEAST_SHARE = 0.02  # of the points; fewer have only not moved yet
@@ -63,21 +61,13 @@ def _(fact: SeparateModes) -> list[str]:
 
 
 def _are_mirrored(model: Model, modes: Sequence[Array]) -> bool:
-    """Whether the modes are one, at both signs of elements whose signs have no meaning."""
+    """Whether the modes are mirror images of one."""
     if noise_seeds(model):
         return False
-    x, density = np.concatenate(modes), cache(partial(ModelDensity, model))
-
-    def evaluate(at: Array) -> Array:
-        return density().evaluate(at)
-
-    folded = x.copy()
-    for i in with_both_signs(model, x):
-        if is_symmetric(x, i, evaluate):
-            folded[:, i] = abs(folded[:, i])
-    for mirror in mirrors_within(_SECONDS, model, folded[np.newaxis], evaluate)[-1:]:
-        folded = mirror.folded[0]
-    parts = np.split(folded, np.cumsum([len(mode) for mode in modes])[:-1])
+    x, evaluate = np.concatenate(modes)[np.newaxis], ModelDensity(model).evaluate
+    if not (mirrors := mirrors_within(_SECONDS, model, x, evaluate)):
+        return False
+    parts = np.split(mirrors[-1].folded[0], np.cumsum([len(mode) for mode in modes])[:-1])
     means, sds = (np.array([f(mode, axis=0) for mode in parts]) for f in (np.mean, np.std))
     return bool((np.ptp(means, axis=0) <= _APART * sds.max(axis=0)).all())
 
