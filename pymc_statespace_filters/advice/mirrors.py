@@ -14,7 +14,7 @@ from ..pymc_model.at_points import ConstrainedValues
 from ..pymc_model.elements import Elements, places_in_vector
 from ..sampling.output.convergence import convergence
 from ..sampling.output.facts import EndedRun
-from .mobility import listed
+from ..tables import joined
 from .signs import sign_text
 
 _MOST_NAMED = 6  # elements
@@ -55,14 +55,14 @@ def mirror_sentence(model: Model, mirror: Mirror) -> str:
     if mirror.is_split and not others:
         return sign_text(first, float(share.mean()))
     where, so = "all chains are in one of", "means, intervals and the evidence lack the other"
-    here, there = (np.flatnonzero(of > _ALL) for of in (1 - share, share))
+    here, there = ([str(i) for i in np.flatnonzero(of > _ALL)] for of in (1 - share, share))
     if mirror.is_split:
         where, so = "the chains pass between", "means say nothing, and longer chains do not help"
-        if len(here) + len(there) == len(share):
-            where = f"chains {listed(here)} are in one and {listed(there)} in the other of"
+        if here and there and len(here) + len(there) == len(share):
+            where = f"chains {joined(here)} are in one and {joined(there)} in the other of"
     if len(turned) > _MOST_NAMED:
         turned[_MOST_NAMED:] = [f"{len(turned) - _MOST_NAMED} others"]
-    signs = f"signs of {listed(turned)} turned together" if others else f"sign of {first} turned"
+    signs = f"signs of {joined(turned)} turned together" if others else f"sign of {first} turned"
     prior = "pm.HalfNormal"
     if first.endswith("]"):
         prior = (

@@ -104,6 +104,7 @@ def test_a_search_ends_with_its_time():
     [
         ([0, 1, 0, 0], "chains 0, 2 and 3 are in one and 1 in the other of "),
         ([0.5, 0.4, 0.6, 1], "the chains pass between "),
+        ([0.03, 0.03, 0.03, 0.03], "the chains pass between "),
         ([1, 1, 1, 1], "all chains are in one of "),
     ],
 )
