@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..compiler.lowering.compiled_system import compile_system
+from ..compiler.native.compilation import without_traces
 from ..errors import ModelError
 from ..facts import Fact, in_words, tell
 from ..system.record import check_system
@@ -41,6 +42,7 @@ def takes(filter: Filter, system: System) -> bool:
     return True
 
 
+@without_traces()
 def check_system_and_filter(system: Any, filter: Any) -> System:
     """Raise unless these are a system and a filter that can treat it; the compiled system."""
     check_system(system)
@@ -78,6 +80,7 @@ def is_unbiased(system: System, filter: Any) -> bool:
     return properties(filter).unbiased or filter.is_exact_for(system)
 
 
+@without_traces()
 def check_choice(system: Any, filter: Any) -> None:
     """Raise unless a filter can treat a system, and warn if it does so badly."""
     compiled = check_system_and_filter(system, filter)

@@ -17,7 +17,7 @@ from pytensor.graph.op import Op
 from pytensor.link.numba.dispatch.basic import numba_njit, register_funcify_and_cache_key
 
 from ..compiler.lowering.compiled_system import CompiledSystem, compile_system
-from ..compiler.native.compilation import COMPILATION
+from ..compiler.native.compilation import COMPILATION, without_traces
 from ..compiler.native.plan import ARGUMENTS, Plan
 from ..compiler.native.planned_function import PlannedFunction
 from ..compiler.native.python_call import TimedCall, call_machine_code
@@ -153,6 +153,7 @@ def _ready(value: Any, kind: np.dtype) -> np.ndarray:
 
 
 @cache
+@without_traces()
 def kernel(op: FilterOp) -> PlannedFunction:
     """The compiled function of an operation, made once."""
     plan = op.plan(compile_system(op.system))

@@ -78,9 +78,10 @@ def drifting(system: "StateSpaceModel", /, **processes: DriftProcess) -> "StateS
     >>> bool((record["states"].sel(state="k") > 0).all())
     True
     """
-    from .record import check_system
+    from .model import StateSpaceModel
 
-    check_system(system)
+    if not isinstance(system, StateSpaceModel):
+        raise ModelError(f"system must be a StateSpaceModel, got {system!r}")
     if not processes:
         raise ModelError(
             "give a process for at least one parameter, such as beta=psf.RandomWalk(); the "

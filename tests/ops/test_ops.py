@@ -13,6 +13,7 @@ from pytensor.graph.traversal import ancestors
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.compiler.native.entry_point import EntryPoint
 from pymc_statespace_filters.errors import GradientUnavailableError, ModelError
+from pymc_statespace_filters.filters.checks import check_choice
 from pymc_statespace_filters.ops.base import evaluator, kernel
 from pymc_statespace_filters.ops.likelihood import LogLikelihood, LogLikelihoodGradient
 from tests.systems import FORCED, PAIR, PAIR_DATA, STEPS, forced, pair, pair_terms
@@ -54,6 +55,26 @@ def test_equal_evaluations_are_made_once():
     evaluations = [n for n in function.maker.fgraph.apply_nodes if isinstance(n.op, LogLikelihood)]
     assert len(evaluations) == 2
     np.testing.assert_array_equal(function(THETA)[0], function(THETA)[1])
+
+
+def test_graphs_of_the_package_keep_no_lines_of_source():
+    """They take a quarter of the time of a first call. The user's flag is set back."""
+    limits = []
+
+    class WatchedOp(LogLikelihood):
+        def plan(self, system):
+            limits.append(pytensor.config.traceback__limit)
+            return super().plan(system)
+
+    class WatchedFilter(psf.EKF):
+        def check(self, system):
+            limits.append(pytensor.config.traceback__limit)
+
+    with pytensor.config.change_flags(traceback__limit=8):
+        check_choice(PAIR, WatchedFilter())
+        kernel(WatchedOp(PAIR, psf.EKF()))
+        assert pytensor.config.traceback__limit == 8
+    assert limits == [0, 0]
 
 
 def key_of(op):

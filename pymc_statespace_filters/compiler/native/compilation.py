@@ -22,6 +22,17 @@ COMPILATION = RLock()
 
 
 @contextmanager
+def without_traces() -> Iterator[None]:
+    """Keep no lines of source with nodes of graphs that are made meanwhile; also a decorator.
+
+    They would be lines of this package, and to find them takes a third of the time in which a
+    system is lowered. The flag is global, so one thread at a time changes it.
+    """
+    with COMPILATION, config.change_flags(traceback__limit=0):
+        yield
+
+
+@contextmanager
 def warning_filter(action: str, message: str) -> Iterator[None]:
     """Filter the `UserWarning` that begins with ``message``, and no other, meanwhile.
 
