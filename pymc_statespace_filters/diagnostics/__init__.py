@@ -1,6 +1,6 @@
 """Diagnostics of filter and model by one-step-ahead prediction of the observations."""
 
-from .constancy import drift_scan
+from .constancy.scan import drift_scan
 from .cross_validation import leave_future_out
 from .filter_health import filter_diagnostics
 from .likelihood_check import check_filter

@@ -1,14 +1,12 @@
 """Evidence of a model from posterior draws, and model comparison by evidence."""
 
-from .comparison import (
-    average_models,
-    compare_evidence,
-    prior_sensitivity,
-)
-from .drift import drift_evidence
+from .comparison.averaging import average_models
+from .comparison.compare import compare_evidence
+from .comparison.prior_sensitivity import prior_sensitivity
+from .drift.drift_evidence import drift_evidence
 from .estimation import EvidenceEstimates, chib_jeliazkov, estimate_evidence
 from .evidence import Evidence
-from .reweighting import reweight
+from .reweighting.reweight import reweight
 from .shorter_steps import step_error
 
 __all__ = [

@@ -333,13 +333,10 @@ def _select_estimators(
     given: str | Estimator | Iterable[str | Estimator], target_se: float
 ) -> list[Estimator]:
     """Look up names, check that the estimators are valid and differ in name, and set targets."""
-    if not isinstance(given, str | Estimator | Iterable):
-        raise ModelError(
-            f"estimators must be names among {list(ESTIMATORS)} or Estimator objects, got {given!r}"
-        )
-    entries = [given] if isinstance(given, str | Estimator) else list(given)
+    if isinstance(given, str | Estimator) or not isinstance(given, Iterable):
+        given = [given]
     found: dict[str, Estimator] = {}
-    for entry in entries:
+    for entry in given:
         if isinstance(entry, str) and entry in FORMER_ESTIMATORS:
             raise ModelError(f"the estimator {entry!r} {FORMER_ESTIMATORS[entry]}")
         estimator = ESTIMATORS.get(entry) if isinstance(entry, str) else entry

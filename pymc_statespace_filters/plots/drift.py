@@ -15,11 +15,9 @@ from ..former_names import former_names
 from .over_time import picture_over_time
 from .picture import Mark
 from .results import select_names, time_label
-from .shapes import band, curve, interval, points
+from .shapes import EXPECTED, ZERO, band, curve, interval, points
 
 SUM = {"color": "C0", "width": 1.5}
-CONSTANT = {"color": "B3", "alpha": 0.3}
-ZERO = {"color": "B2", "width": 0.8}
 TURN = {"color": "C1", "diameter": 6}
 MOST_PANELS = 12
 
@@ -106,7 +104,7 @@ def plot_drift(
     return picture_over_time(
         sums,
         [
-            Mark(band, "constant", constant, CONSTANT, "95 % of constant parameters"),
+            Mark(band, "constant", constant, EXPECTED, "95 % of constant parameters"),
             Mark(hline, "zero", xr.zeros_like(sums.isel(time=0, drop=True)), ZERO),
             Mark(curve, "sum", sums, SUM, "summed scores (sd)"),
             Mark(points, "turn", turns, TURN, "time of the change"),

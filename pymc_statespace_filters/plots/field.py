@@ -11,11 +11,10 @@ from arviz_plots.visuals import hline
 
 from ..errors import ModelError
 from .picture import Mark, picture
-from .shapes import band, bars, curve, interval, points
+from .shapes import ZERO, band, bars, curve, interval, points
 
 MEAN = {"color": "C0", "width": 1.5}
 BAND = {"color": "C0", "alpha": 0.3}
-ZERO = {"color": "B2", "width": 0.8}
 RUG = {"color": "C1", "width": 0.8, "alpha": 0.5}
 VISITED = {"color": "C1", "diameter": 2.0, "alpha": 0.8, "width": 0, "marker": "C0"}
 SIZE, SIZE_OF_MAP = (6.0, 3.2), (4.0, 3.4)  # inches of a panel

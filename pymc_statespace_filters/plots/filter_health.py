@@ -19,6 +19,7 @@ from .over_time import over_draws, spread_of
 from .picture import Mark, picture, titles_of
 from .results import diagnostics_of, time_label
 from .shapes import (
+    EXPECTED,
     band,
     bars,
     curve,
@@ -35,7 +36,6 @@ PROB, TAIL = 0.95, 1.96  # of the bands expected of a calibrated filter
 PIT_GRID = np.linspace(0, 1, 101)
 N_SIMULATIONS = 1000  # of uniform numbers, for the simultaneous band of their ECDF
 SEEN = {"color": "C0"}
-EXPECTED = {"color": "B3", "alpha": 0.3}
 CUT = {"color": "C1", "marker": "C3", "diameter": 6}
 LIMIT = {"color": "B1", "linestyle": "C1"}
 SIZE, PANELS_IN_LINE = (3.8, 2.6), 4  # inches of a panel

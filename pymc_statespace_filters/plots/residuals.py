@@ -12,12 +12,10 @@ from ..errors import ModelError
 from ..former_names import former_names
 from .picture import Mark, picture, titles_of, with_unit
 from .results import SAMPLE_DIMS, diagnostics_of, group_of, time_label, unit_of
-from .shapes import bars, from_zero, interval, point_size, points
+from .shapes import EXPECTED, ZERO, bars, from_zero, interval, point_size, points
 
 TAIL = 1.96  # of the 95 % band of a standard normal
 SEEN = {"color": "C0"}
-EXPECTED = {"color": "B3", "alpha": 0.3}
-ZERO = {"color": "B2", "width": 0.8}
 WIDTH, WIDTH_ALONE, HEIGHT = 4.2, 7.0, 2.6  # inches of a column, of a single one, of a panel
 
 

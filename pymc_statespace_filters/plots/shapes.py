@@ -9,6 +9,8 @@ import xarray as xr
 from arviz_plots.plot_collection import backend_from_object
 
 BOUND = "ci_bound"
+EXPECTED = {"color": "B3", "alpha": 0.3}  # what a correct model or filter would give
+ZERO = {"color": "B2", "width": 0.8}
 FEW = 200  # observations that fit beside each other as separate marks
 DIAMETER, LEAST_DIAMETER, LEAST_ALPHA = 4.0, 2.0, 0.6  # of points
 

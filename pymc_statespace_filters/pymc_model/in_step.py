@@ -20,11 +20,6 @@ from ..parallel.shared_rows import rows_shared_by
 from .fingerprint import model_data_fingerprint, model_fingerprint
 from .inspection import given_model
 
-_SEED_ADVICE = (
-    ", and the same integer as random_seed: a Generator is the same on two ranks only if both were "
-    "made of the same seed and have drawn as much"
-)
-
 
 def shared_by_ranks[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     """Let the ranks of a function's argument ``comm`` share the points that it evaluates.
@@ -71,11 +66,7 @@ def _share_arguments(comm: Communicator, ranks: Ranks, given: BoundArguments) ->
         built = [given_model(values["model"])]
         values["model"] = built[0]
     settings = ranks.settings | {"random_seed": _comparable(values.get("random_seed"))}
-    check_same_call(
-        comm,
-        lambda: [settings, *(_identity(given_model(one)) for one in built)],
-        {"random_seed": _SEED_ADVICE},
-    )
+    check_same_call(comm, lambda: [settings, *(_identity(given_model(one)) for one in built)])
     # What has a checkpoint goes on with the numbers of a run that had no seed either.
     if values.get("random_seed", 0) is None and "checkpoint" not in values:
         values["random_seed"] = comm.broadcast(int(np.random.default_rng().integers(2**63)))

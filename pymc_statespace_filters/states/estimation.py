@@ -10,12 +10,12 @@ import xarray as xr
 from ..pymc_model.checked_model import checked_model
 from ..pymc_model.in_step import shared_by_ranks
 from ..pymc_model.observation_moments import sensors_of_states
-from ..pymc_model.state_space_variable import observed_variables, smoothing_method
+from ..pymc_model.state_space_variable import smoothing_method
 from ..system.checks import check_random_seed
 from ..system.own_units import in_own_units, moments_in_own_units
 from ..system.steps import check_at, rows_at
 from .draws import select_draws
-from .groups import add_group, results_by_row, state_dims, times_of
+from .groups import add_group, results_by_row, times_of
 from .variable import VariableAtDraws, select_variables
 
 
@@ -194,7 +194,6 @@ def _add_states(
     check_at(at)
     rng = check_random_seed(random_seed)
     draws = select_draws(idata, n_draws)
-    dims = state_dims(observed_variables(model))
     parts = []
     for variable in select_variables(model, var_name, filter):
         at_draws = VariableAtDraws(model, variable, draws)
@@ -217,7 +216,6 @@ def _add_states(
                 f"{name}_sd": ("state", [sd for _, sd in own_units]),
                 f"{name}_n_effective": ("", [one.n_effective for one in states]),
             },
-            dims[name],
         )
         part[f"{name}_states"].attrs = {
             "filter": repr(variable.filter),

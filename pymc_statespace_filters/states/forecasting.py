@@ -13,7 +13,6 @@ from ..errors import ModelError
 from ..evaluation.simulate import continuation
 from ..pymc_model.checked_model import checked_model
 from ..pymc_model.in_step import shared_by_ranks
-from ..pymc_model.state_space_variable import observed_variables
 from ..system.checks import check_random_seed, is_integer
 from ..system.events import Events, read_events, with_events
 from ..system.given_record import events_of_records, inputs_with_times, own_inputs
@@ -38,7 +37,7 @@ from ..system.time_axis import (
 )
 from ..system.timed_inputs import check_inputs_at, timed_inputs
 from .draws import select_draws
-from .groups import add_group, results_by_row, state_dims
+from .groups import add_group, results_by_row
 from .record import Array, RecordAtDraws
 from .variable import VariableAtDraws, select_variables
 
@@ -140,7 +139,6 @@ def forecast(
     model = checked_model(model, idata, any_filter=filter is not None, new_data=new_data)
     rng = check_random_seed(random_seed)
     draws = select_draws(idata, n_draws)
-    dims = state_dims(observed_variables(model))
     parts = []
     for variable in select_variables(model, var_name, filter):
         name, system = variable.name, variable.system
@@ -186,7 +184,6 @@ def forecast(
                     name: ("observable", simulated),
                     f"{name}_states": ("state", [in_own_units(system, path) for path in paths]),
                 },
-                dims[name],
             )
         )
         at_draws.warn_about([one.health for one in initial], [one.seeds for one in initial])

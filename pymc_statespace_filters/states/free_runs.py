@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from functools import partial
 from itertools import repeat
 from threading import Event
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pymc as pm
@@ -17,17 +17,15 @@ from ..evaluation.simulate import simulator
 from ..parallel.cpu_affinity import available_cores
 from ..parallel.threads import run_in_threads
 from ..pymc_model.checked_model import checked_model
-from ..pymc_model.state_space_variable import observed_variables
 from ..system.checks import check_flag, check_random_seed, shortened
 from ..system.given_record import events_of_records, inputs_with_times
 from ..system.input_columns import check_inputs, only_seen
-from ..system.model import StateSpaceModel
 from ..system.own_units import in_own_units
 from ..system.placement import Placement, Timing, place_by
 from ..system.record import check_observed
 from ..system.timed_inputs import check_inputs_at
 from .draws import SAMPLE_DIMS, select_draws
-from .groups import add_group, by_record, results_by_row, state_dims
+from .groups import add_group, by_record, results_by_row
 from .record import Array, RecordAtDraws, simulate_observations
 from .variable import VariableAtDraws, select_variables
 
@@ -161,7 +159,6 @@ def free_run(
     is_elsewhere = steps is not None or times is not None
     is_own_run = inputs is None and events is None and not is_elsewhere
     is_compared = observed is not None or is_own_run
-    dims = state_dims(observed_variables(model))
     parts = []
     for variable in variables:
         at_draws = VariableAtDraws(model, variable, draws)
@@ -176,14 +173,14 @@ def free_run(
                 (axis,), system = one.axes, one.system
                 measured = _measured(record, observed, axis.steps) if is_compared else None
                 data = measured if is_elsewhere else record.observed
-                at = _At(system, axis.steps, _input_rows(record, one, data))
-                path, values = _simulate(at_draws, record, at, with_noise, own)
+                rows = _input_rows(record, one, data)
+                path, values = _simulate(at_draws, record, one, rows, with_noise, own)
                 paths.append(path)
                 seen.append(values)
                 if measured is not None:
                     noisy = values
                     if not with_noise:
-                        noisy = simulate_observations(record, system, path, at.steps, at.rows, own)
+                        noisy = simulate_observations(record, system, path, axis.steps, rows, own)
                     predicted = draws.dataset({name: ((time, observable), values)}, names)[name]
                     errors.append(prediction_errors(predicted, noisy, measured))
         _warn_of_failed_runs(name, paths)
@@ -194,7 +191,6 @@ def free_run(
                 name: ("observable", seen),
                 f"{name}_states": ("state", [in_own_units(variable.system, one) for one in paths]),
             },
-            dims[name],
         )
         if errors:
             part = part.merge(by_record(at_draws, errors))
@@ -278,17 +274,6 @@ def _measured(record: RecordAtDraws, observed: Any, steps: NDArray[np.int64]) ->
     return check_observed(observed, record.variable.system, steps.size)
 
 
-class _At(NamedTuple):
-    """Where a record runs: the steps (R,) of its observations and its input rows, by draw or one.
-
-    ``system`` is the one that takes these steps.
-    """
-
-    system: StateSpaceModel
-    steps: NDArray[np.int64]
-    rows: Array
-
-
 def _input_rows(record: RecordAtDraws, placed: Placement, data: Array | None) -> Array:
     """The input rows (draws or 1, rows, columns) of a run: those given, else the model's.
 
@@ -307,18 +292,19 @@ def _input_rows(record: RecordAtDraws, placed: Placement, data: Array | None) ->
 def _simulate(
     at_draws: VariableAtDraws,
     record: RecordAtDraws,
-    at: _At,
+    placed: Placement,
+    rows: Array,
     noise: bool,
     rng: np.random.Generator,
 ) -> tuple[Array, Array]:
     """States (draws, R, n) and observations (draws, R, p), each chain in a thread of its own.
 
-    NaN for a draw with a number that is not finite.
+    ``rows`` are the inputs, by draw or one. NaN for a draw with a number that is not finite.
     """
-    t0, theta = record.t0, record.theta
-    run, n_chains = simulator(at.system, noise).function, at_draws.draws.shape[0]
-    paths = np.empty((len(theta), at.steps.size, at.system.n))
-    seen = np.empty((len(theta), at.steps.size, at.system.p))
+    t0, theta, system, steps = record.t0, record.theta, placed.system, placed.axes[0].steps
+    run, n_chains = simulator(system, noise).function, at_draws.draws.shape[0]
+    paths = np.empty((len(theta), steps.size, system.n))
+    seen = np.empty((len(theta), steps.size, system.p))
     stopped, n_done = Event(), np.zeros(n_chains, dtype=np.int64)
 
     def simulate_chain(number: int, chain: NDArray[np.int64], seed: np.int64) -> None:
@@ -326,9 +312,9 @@ def _simulate(
         for i in chain:
             if stopped.is_set():
                 return
-            inputs = at.rows[i if len(at.rows) > 1 else 0]
-            states, seen[i] = run(own_rng, theta[i], at.steps, inputs, t0)
-            paths[i] = states[at.steps]
+            inputs = rows[i if len(rows) > 1 else 0]
+            states, seen[i] = run(own_rng, theta[i], steps, inputs, t0)
+            paths[i] = states[steps]
             n_done[number] += 1
 
     chains = np.split(np.arange(len(theta)), n_chains)

@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from ..pymc_model.state_space_variable import StateSpaceVariable
+from ..pymc_model.state_space_variable import StateSpaceVariable, observed_variables
 from .record import Array
 from .variable import VariableAtDraws
 
@@ -26,18 +26,18 @@ def results_by_row(
     at_draws: VariableAtDraws,
     times: Sequence[Array],
     found: Mapping[str, tuple[str, Sequence[Array]]],
-    state: str = "",
 ) -> xr.Dataset:
     """Results by draw and row, (chain, draw, R, ...), with the coordinates of rows and of names.
 
     ``times`` are those of the rows of each record. Of each of the ``found`` there is the dimension
     after the rows, "state" or "observable" or "" for none, and the array (draws, rows, ...) of each
-    record. ``state`` is the name of the dimension of states.
+    record.
     """
     variable = at_draws.variable
     time, observable = variable.dims
+    dims = state_dims(observed_variables(at_draws.model))
     names = {
-        "state": (state, list(variable.system.states)),
+        "state": (dims[variable.name], list(variable.system.states)),
         "observable": (observable, list(variable.system.observables)),
     }
     used = [names[kind] for kind, _ in found.values() if kind]

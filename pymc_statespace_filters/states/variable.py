@@ -45,7 +45,7 @@ class VariableAtDraws:
     def __init__(
         self, model: pm.Model, variable: StateSpaceVariable, draws: PosteriorDraws
     ) -> None:
-        self._model, self.variable, self.draws = model, variable, draws
+        self.model, self.variable, self.draws = model, variable, draws
         self.on_progress: Callable[[int], None] = lambda count: None
         # Stop at variables of the model: free ones are replaced by their draws.
         known = set(ancestors([variable.theta, variable.inputs], blockers=model.basic_RVs))
@@ -102,7 +102,7 @@ class VariableAtDraws:
         observed = np.concatenate([record.observed for record in self.records])
         rows = only_seen(system, rows, table, observed)
         changed = variable._replace(inputs=pt.as_tensor(rows), steps=pt.as_tensor(table))
-        return VariableAtDraws(self._model, changed, self.draws)
+        return VariableAtDraws(self.model, changed, self.draws)
 
     def generators(self, rng: np.random.Generator) -> list[np.random.Generator]:
         """A generator for each record, which does not depend on the other records."""
@@ -190,7 +190,7 @@ class VariableAtDraws:
         if not variable.is_panel:
             return [RecordAtDraws(self, 0, None, None, steps, observed, float(t0))]
         records = records_of(steps[:, RECORD])
-        labels = self._model.coords.get(f"{variable.name}_record", ())
+        labels = self.model.coords.get(f"{variable.name}_record", ())
         if len(labels) != len(records.labels):  # other rows were set
             labels = records.labels
         first_inputs, n_rows = steps[records.starts[:-1], FIRST_INPUT], self.inputs.shape[1]

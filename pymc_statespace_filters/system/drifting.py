@@ -78,10 +78,9 @@ def drifting(system: "StateSpaceModel", /, **processes: DriftProcess) -> "StateS
     >>> bool((record["states"].sel(state="k") > 0).all())
     True
     """
-    from .model import StateSpaceModel
+    from .record import check_system
 
-    if not isinstance(system, StateSpaceModel):
-        raise ModelError(f"system must be a StateSpaceModel, got {system!r}")
+    check_system(system)
     if not processes:
         raise ModelError(
             "give a process for at least one parameter, such as beta=psf.RandomWalk(); the "

@@ -9,7 +9,7 @@ import pymc as pm
 import pytest
 import xarray as xr
 from scipy.integrate import quad
-from scipy.stats import halfnorm, multivariate_normal, norm, uniform
+from scipy.stats import halfnorm, norm, uniform
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.errors import EvidenceWarning, ModelError
@@ -32,10 +32,16 @@ HALF_NORMAL = halfnorm(scale=WIDTH).pdf
 QUIET = {"random_seed": 1, "progressbar": False}
 
 
+def log_normal(observed, covs):
+    """The log-density (...) of a record by normals of mean zero with covariances (..., T, T)."""
+    solved = np.linalg.solve(covs, observed[:, None])[..., 0] @ observed
+    return -0.5 * (solved + np.linalg.slogdet(2 * np.pi * covs)[1])
+
+
 def log_likelihood(observed, strength):
-    """With the mean integrated out; exact."""
-    cov = np.eye(N_ROWS) + MEAN_SD**2 + strength**2 * PATH_COV
-    return multivariate_normal(np.zeros(N_ROWS), cov).logpdf(observed)
+    """With the mean integrated out; exact, for strengths (...)."""
+    s = np.asarray(strength)[..., None, None]
+    return log_normal(observed, np.eye(N_ROWS) + MEAN_SD**2 + s**2 * PATH_COV)
 
 
 def record(strength, random_seed):
@@ -91,7 +97,7 @@ def drawn_means(observed, path_covs, rng):
 def exact_draws(observed, density, largest, n=(4, 1000), random_seed=3, signed=False):
     """Independent draws of strength and mean: by quadrature, and by conjugacy given it."""
     rng, grid = np.random.default_rng(random_seed), on_grid(largest)
-    log_posterior = [log_likelihood(observed, s) + np.log(density(s)) for s in grid]
+    log_posterior = log_likelihood(observed, grid) + np.log(density(grid))
     s = drawn_strengths(grid, log_posterior, n, rng)
     mu = drawn_means(observed, s[..., None, None] ** 2 * PATH_COV, rng)
     if signed:
@@ -336,9 +342,7 @@ def test_records_of_a_panel_with_one_strength_or_their_own(shared):
             steps=np.tile(np.arange(N_ROWS), 2), observed=np.concatenate(records),
         )  # fmt: skip
     grid = on_grid(8 * WIDTH)
-    logs = np.array(
-        [[log_likelihood(d, s) - log_likelihood(d, 0.0) for s in grid] for d in records]
-    )
+    logs = np.array([log_likelihood(d, grid) - log_likelihood(d, 0.0) for d in records])
     log_prior = np.log(HALF_NORMAL(grid) * (grid[1] - grid[0]))
     logs = logs.sum(axis=0, keepdims=True) if shared else logs
     exact = np.log(np.exp(logs + log_prior).sum(axis=1)).sum()
@@ -385,9 +389,7 @@ def test_without_strength_the_rate_of_return_has_no_influence():
         psf.StateSpace("d", returning, psf.EKF(), steps=range(N_ROWS), observed=observed)
     s, z = np.meshgrid(np.linspace(0, 4 * WIDTH, 121)[1:] - WIDTH / 60, np.linspace(-4, 4, 81))
     rate = 0.3 * np.exp(z)
-    covs = returning_cov(s, rate) + np.eye(N_ROWS) + MEAN_SD**2
-    solved = np.linalg.solve(covs, observed[:, None])[..., 0] @ observed
-    log_l = -0.5 * (solved + np.linalg.slogdet(2 * np.pi * covs)[1])
+    log_l = log_normal(observed, returning_cov(s, rate) + np.eye(N_ROWS) + MEAN_SD**2)
     log_prior = halfnorm.logpdf(s, scale=WIDTH) + norm.logpdf(z)
     joint = np.exp(log_l - log_likelihood(observed, 0.0) + log_prior) * WIDTH / 30 * 0.1
     chosen = rng.choice(s.size, size=(4, 1000), p=joint.ravel() / joint.sum())

@@ -26,7 +26,6 @@ from tests.systems import FREE, counts
 reweight = partial(psf.reweight, progressbar=False)
 estimate_evidence = partial(psf.estimate_evidence, progressbar=False, random_seed=6)
 
-pytestmark = pytest.mark.usefixtures("interpreted")
 
 # Truth known: normal laws and log-normal noise.
 

@@ -63,7 +63,7 @@ def test_no_problems_are_found_only_where_the_data_were_not_doubted(sampler, cap
             doubted = model(row5=value)
         caplog.clear()
         with caplog.at_level(logging.DEBUG, logger="pymc"):
-            psf.sample(1000, sampler=sampler, model=doubted, random_seed=1, progressbar=False)
+            psf.sample(400, sampler=sampler, model=doubted, random_seed=1, progressbar=False)
         said.append("No problems found" in caplog.text)
     assert said == [True, False]
 
@@ -126,7 +126,7 @@ def test_nuts_that_cannot_start_leaves_the_draws_of_the_walk():
 
 
 def test_a_funnel_ends_the_run_at_the_first_doubling_that_does_not_help(caplog):
-    tree = psf.sample(250, tune=500, model=schools(centred=True), **CALL)
+    tree = psf.sample(150, tune=300, model=schools(centred=True), **CALL)
 
     assert 2 <= tree.attrs["iterations_per_draw"] <= 32  # of 64
     assert "draws diverged, most where tau is small" in caplog.text
@@ -136,5 +136,6 @@ def test_a_funnel_ends_the_run_at_the_first_doubling_that_does_not_help(caplog):
 
 def test_chains_that_do_not_diverge_go_on_however_little_they_gain(monkeypatch):
     monkeypatch.setattr(chains, "_LEAST_GROWTH", 1e6)
-    tree = psf.sample(100, tune=300, until_ess=395, model=schools(centred=False), **CALL)
+    few = {"tune": 300, "until_ess": 395, "max_draws": 400}
+    tree = psf.sample(100, model=schools(centred=False), **few, **CALL)
     assert tree.attrs["iterations_per_draw"] > 2

@@ -37,12 +37,6 @@ from .model_task import ModelTask
 from .request import ExecutionOptions, SamplingRequest
 from .scheduler import run_chains
 
-_SEED_ADVICE = (
-    ", and the same integer as random_seed: a Generator is the same on two ranks only if both were "
-    "made of the same seed and have drawn as much"
-)
-_PILOT_ADVICE = ', and the same pilot, which comm={"gather": "all"} gives to all ranks'
-
 
 @keeps_what_is_there
 def sample_models(
@@ -175,7 +169,7 @@ def _check_agreement(
             ),
         ]
 
-    check_same_call(comm, settings, {"random_seed": _SEED_ADVICE, "pilot": _PILOT_ADVICE})
+    check_same_call(comm, settings)
 
 
 def _open_checkpoints(

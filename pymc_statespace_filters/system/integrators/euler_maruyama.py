@@ -4,8 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
 from .substeps import SubstepIntegrator, Values, check_needed
@@ -56,11 +54,3 @@ class EulerMaruyama(SubstepIntegrator):
     def advance(self, now: Values, noise: TensorVariable, length: float) -> TensorVariable:
         """The state after a substep."""
         return now["x"] + length * self._drift(now) + self._shock(now, noise, length)
-
-    def is_stable_at(self, eigenvalues: NDArray[np.complex128]) -> NDArray[np.bool_]:
-        """Whether no eigenvalue has a negative real part.
-
-        The equation multiplies a small deviation by exp(a h), an Euler-Maruyama step by 1 + a h:
-        where that is negative, the step overshoots.
-        """
-        return eigenvalues.real.min(axis=-1) >= 0

@@ -98,10 +98,6 @@ class Milstein(SubstepIntegrator):
         """The integrator for filters that linearise a step in its noise."""
         return EulerMaruyama(self.drift, self.diffusion, self.dt, self.substeps)
 
-    def is_stable_at(self, eigenvalues: NDArray[np.complex128]) -> NDArray[np.bool_]:
-        """Whether no eigenvalue has a negative real part, as for `EulerMaruyama`."""
-        return eigenvalues.real.min(axis=-1) >= 0
-
 
 def _along(column: TensorVariable, x: TensorVariable, direction: TensorVariable) -> TensorVariable:
     """Derivative of a vector along a direction."""

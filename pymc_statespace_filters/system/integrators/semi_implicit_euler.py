@@ -6,7 +6,6 @@ from typing import Any, Self
 
 import numpy as np
 import pytensor.tensor as pt
-from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
 from ...errors import ModelError
@@ -76,15 +75,6 @@ class SemiImplicitEuler(SubstepIntegrator):
         between = pt.stack([pushed[i] if new else x[i] for i, new in enumerate(is_velocity)])
         moved = x + length * self._drift({**now, "x": between}) + shock
         return pt.stack([pushed[i] if new else moved[i] for i, new in enumerate(is_velocity)])
-
-    def is_stable_at(self, eigenvalues: NDArray[np.complex128]) -> NDArray[np.bool_]:
-        """Whether no eigenvalue has a negative real part.
-
-        A step turns the phase of an oscillator without damping by an angle whose cosine is
-        1 - (w h)^2 / 2. It loses its stability at w h = 2, where the angle is half a turn; beyond
-        a quarter of a turn, w h = 1.4, it does not follow the oscillation.
-        """
-        return eigenvalues.real.min(axis=-1) >= 0
 
     def _velocity_indices(self, n: int) -> list[int]:
         indices = [_index(v, None) for v in self.velocities]
