@@ -1,5 +1,6 @@
 """Tables that print their main columns, and sentences below them, in 80 columns of text."""
 
+import re
 from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from textwrap import fill
@@ -74,5 +75,6 @@ class SentenceTable(pd.DataFrame):
 
     def _all_sentences(self) -> tuple[str, ...]:
         others = [str(name) for name in self.columns if name not in self.main_columns]
+        others = list(dict.fromkeys(re.sub(r"\[.*\]", "[...]", name) for name in others))
         further = f"Further columns, shown by .to_string(): {', '.join(others)}."
         return (*self.sentences, further) if others else self.sentences

@@ -1,7 +1,6 @@
 """The table of `expected_information`: its columns, and what it says of them."""
 
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -44,11 +43,6 @@ class DesignsTable(SentenceTable):
         DECIDED,
         MISLED,
     )
-
-    def _all_sentences(self) -> tuple[str, ...]:
-        others = [str(name) for name in self.columns if name not in self.main_columns]
-        kinds = dict.fromkeys(re.sub(r"\[.*\]", "[...]", name) for name in others)
-        return (*self.sentences, f"Further columns, shown by .to_string(): {', '.join(kinds)}.")
 
     def _texts(self, name: str) -> list[str]:
         return ["unknown" if math.isnan(value) else f"{value:.3f}" for value in self[name]]

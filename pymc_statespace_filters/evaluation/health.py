@@ -38,15 +38,7 @@ class Health(Fact):
         """The smallest effective number of particles of each evaluation that has not failed."""
         return np.where(self.failed, np.inf, self.health[:, 0])
 
-
-def tell_of_health(
-    system: StateSpaceModel,
-    filter: Any,
-    health: np.ndarray,
-    arguments_of: Callable[[int], Arguments],
-    labels: Sequence[Any] | None = None,
-) -> None:
-    """Warn once of each failure, and once of collapse, if there are any; see `Health`."""
-    found = Health(system, filter, health, arguments_of, labels)
-    if found.failed.any() or (found.smallest < COLLAPSED).any():
-        tell(found)
+    def tell(self) -> None:
+        """Warn once of each failure, and once of collapse, if there are any."""
+        if self.failed.any() or (self.smallest < COLLAPSED).any():
+            tell(self)

@@ -23,7 +23,7 @@ from ..system.model import StateSpaceModel
 from ..system.parameters import flat_parameters, panel_parameters
 from ..system.record import Record, check_seed, read_record
 from .exact_rows import check_rows
-from .health import tell_of_health
+from .health import Health
 
 
 def log_likelihood(
@@ -129,7 +129,7 @@ def log_likelihood(
         else:
             found = _at_points(record, filter, flat_parameters(record.system, params), seeds, ranks)
         if ranks.rank == 0:
-            tell_of_health(record.system, filter, found.health, found.arguments_of, record.labels)
+            Health(record.system, filter, found.health, found.arguments_of, record.labels).tell()
     return found.terms
 
 

@@ -26,7 +26,7 @@ from ..system.placement import Earlier
 from ..system.record import check_seed, read_record
 from ..system.steps import check_at, rows_at
 from .exact_rows import check_rows
-from .health import tell_of_health
+from .health import Health
 
 STATE, _RECORD, _RESETS = "filter_state", "filter_state_record", "accumulators_reset"
 
@@ -169,7 +169,7 @@ def run_filter(
     parts = zip(arguments, rows, before, strict=True)
     runs = [evaluate(*each, own, start) for each, own, start in parts]
     terms, health, *states, left = (list(results) for results in zip(*runs, strict=True))
-    tell_of_health(system, filter, np.array(health), lambda i: arguments[i], labels=labels)
+    Health(system, filter, np.array(health), lambda i: arguments[i], labels).tell()
     row_dim, term_dim = ("time", "obs_time") if panel is None else ("row", "obs")
     are_points = (
         bool(system.drifting)

@@ -118,7 +118,8 @@ def step_stability(model: pm.Model) -> Callable[[Array], NDArray[np.bool_]] | No
 
     def is_stable(system: StateSpaceModel, *arguments: Array) -> NDArray[np.bool_]:
         assert system.integrator is not None
-        return system.integrator.is_stable_at(path_eigenvalues(system, *arguments)).all(axis=1)
+        [eigenvalues] = path_eigenvalues([system], *arguments)
+        return system.integrator.is_stable_at(eigenvalues).all(axis=1)
 
     along = _along_paths(model, is_stable)
     return None if along is None else lambda x: along(x).all(axis=1)
@@ -136,7 +137,7 @@ def step_accuracy(model: pm.Model) -> Callable[[Array], Array] | None:
         if system.integrator.is_stable_at(_ANY_FACTOR).all():  # exact for linear equations
             return np.zeros(len(arguments[0]))
         half = system.with_integrator(system.integrator.refined())
-        factors, of_halves = _path_eigenvalues([system, half], *arguments)
+        factors, of_halves = path_eigenvalues([system, half], *arguments)
         differences = np.abs(np.sort(factors, axis=-1) - np.sort(of_halves**2, axis=-1))
         return np.nan_to_num(differences, nan=0.0).max(axis=(1, 2))
 
@@ -203,21 +204,14 @@ def _each_record(theta: Array, rows: Array, inputs: Array, t0: Array) -> list[Ar
 
 
 def path_eigenvalues(
-    system: StateSpaceModel, theta: Array, steps: Array, inputs: Array, t0: Array
-) -> NDArray[np.complex128]:
-    """Eigenvalues (m, K, n) of the Jacobian of a substep at K states of the path without noise.
-
-    It is that of the substep which the integrator names for this, if it names one. The arguments
-    are those of the likelihood at m points. The path starts from the initial mean. Eigenvalues are
-    NaN where the Jacobian is not finite.
-    """
-    return _path_eigenvalues([system], theta, steps, inputs, t0)[0]
-
-
-def _path_eigenvalues(
     systems: Sequence[StateSpaceModel], theta: Array, steps: Array, inputs: Array, t0: Array
 ) -> list[NDArray[np.complex128]]:
-    """Those of substeps of each system, along the path of the first."""
+    """Eigenvalues (m, K, n) of the Jacobians of each system's substep at K states of one path.
+
+    The substep is that which the integrator names for this, if it names one. The path is that of
+    the first system without noise, from the initial mean. The arguments are those of the likelihood
+    at m points. Eigenvalues are NaN where the Jacobian is not finite.
+    """
     system = systems[0]
     assert system.integrator is not None
     single = system.with_integrator(system.integrator.substep())

@@ -18,7 +18,7 @@ from ..compiler.native.pytensor_function import NativeFunction
 from ..compiler.native.rows import Rows
 from ..compiler.numerics.philox import generators_of_records
 from ..errors import ModelError
-from ..evaluation.health import tell_of_health
+from ..evaluation.health import Health
 from ..filters.outcomes import NONE
 from ..progress import row_progress
 from ..pymc_model.state_space_variable import (
@@ -130,13 +130,9 @@ class VariableAtDraws:
             number, draw = divmod(i, self.n_draws)
             return self.records[number].arguments(draw, seeds[number][draw])
 
-        tell_of_health(
-            self.variable.system,
-            self.variable.filter,
-            np.concatenate(health),
-            arguments_of,
-            labels=[one.label for one in self.records] if self.variable.is_panel else None,
-        )
+        labels = [one.label for one in self.records] if self.variable.is_panel else None
+        system, filter = self.variable.system, self.variable.filter
+        Health(system, filter, np.concatenate(health), arguments_of, labels).tell()
 
     def _check_seeds(self, failed: NDArray[np.bool_]) -> None:
         """Raise if the stored seeds cannot be those of the draws, given where the filter fails.

@@ -8,7 +8,7 @@ import pytest
 
 import pymc_statespace_filters as psf
 from pymc_statespace_filters.advice import health
-from pymc_statespace_filters.evaluation.health import tell_of_health
+from pymc_statespace_filters.evaluation.health import Health
 from pymc_statespace_filters.filters.outcomes import COLLAPSED, Failure
 
 # Health that does not come from a filter: smallest effective number, failure, observation.
@@ -40,7 +40,7 @@ def warned(rows, filter=PARTICLES, system=SYSTEM):
     asked = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        tell_of_health(system, filter, np.array(rows), lambda i: asked.append(i) or RECORD)
+        Health(system, filter, np.array(rows), lambda i: asked.append(i) or RECORD).tell()
     return [str(w.message) for w in caught], asked
 
 

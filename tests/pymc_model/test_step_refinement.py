@@ -42,13 +42,14 @@ def multiplier(system, theta, n_steps=100, inputs=None, t0=0.0):
 def eigenvalues(system, theta, n_steps=100, inputs=None, t0=0.0):
     m = len(theta)
     inputs = np.zeros((0, system.n_inputs)) if inputs is None else inputs
-    return path_eigenvalues(
-        system,
+    [found] = path_eigenvalues(
+        [system],
         np.asarray(theta),
         np.tile(np.arange(n_steps + 1), (m, 1)),
         np.tile(inputs, (m, 1, 1)),
         np.full(m, t0),
     )
+    return found
 
 
 @pytest.mark.parametrize("substeps", [1, 2, 5])

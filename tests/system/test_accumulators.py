@@ -271,8 +271,8 @@ def test_a_reset_happens_once_in_a_step_of_substeps_and_is_no_overshoot():
     refined = system.with_integrator(integrator.refined())
     assert refined.accumulators == ("x1",)
     ones = np.ones((1, 3, 1))
-    eigenvalues = path_eigenvalues(
-        system, np.array([[0.4]]), np.array([[1, 2, 3]]), ones, np.zeros(1)
+    [eigenvalues] = path_eigenvalues(
+        [system], np.array([[0.4]]), np.array([[1, 2, 3]]), ones, np.zeros(1)
     )
     assert (eigenvalues.real > 0.89).all()
 

@@ -250,7 +250,7 @@ def test_integrators_of_shorter_steps_keep_the_drift():
     assert (system.m, finer.m, coarse.m) == (3, 5, 5)
     theta = np.array([[1.2, 0.7, 0.5]])
     rows = np.column_stack([PUSH, np.arange(20) % 2])[None]
-    eigenvalues = path_eigenvalues(system, theta, np.array([[20]]), rows, np.zeros(1))
+    [eigenvalues] = path_eigenvalues([system], theta, np.array([[20]]), rows, np.zeros(1))
     np.testing.assert_allclose(sorted(eigenvalues[0, 0].real), [1 - 1.2 * DT / 2, 1.0])
 
 

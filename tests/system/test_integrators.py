@@ -482,7 +482,8 @@ def eigenvalues_at(integrator, value, n=1):
     system = system_of(integrator, mean=(1.0,) * n)
     theta, steps = np.array(value, dtype=float)[:, None], np.ones((len(value), 1), dtype=int)
     nothing = np.zeros((len(value), 0, 0))
-    return system.integrator, path_eigenvalues(system, theta, steps, nothing, np.zeros(len(value)))
+    [found] = path_eigenvalues([system], theta, steps, nothing, np.zeros(len(value)))
+    return system.integrator, found
 
 
 def test_runge_kutta_tells_slow_decays_from_fast_ones():
