@@ -116,8 +116,8 @@ def known_start():
     )
 
 
-EVERY_SECOND = np.arange(0, 40, 2)
-SMALLER = np.where(np.arange(42) < 20, 1.0, 0.02)[:, np.newaxis]
+EVERY_SECOND = np.arange(0, 28, 2)
+SMALLER = np.where(np.arange(30) < 14, 1.0, 0.02)[:, np.newaxis]
 ON_GRIDS = {
     "vanishing noise": (vanishing, {"s": 0.2}, EVERY_SECOND[1:], None),
     "smaller noise": (damped, {}, EVERY_SECOND, SMALLER),

@@ -108,7 +108,7 @@ def test_the_gradient_is_that_of_the_likelihood_and_does_not_see_what_is_missing
 
 
 STEPS = np.arange(0, 300, 5)
-RATE, LEVEL = np.meshgrid(np.linspace(0.02, 3.0, 40), np.linspace(-0.7, 2.3, 25), indexing="ij")
+RATE, LEVEL = np.meshgrid(np.linspace(0.02, 3.0, 24), np.linspace(-0.7, 2.3, 16), indexing="ij")
 
 
 def decays(rate):
