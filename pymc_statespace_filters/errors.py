@@ -24,8 +24,12 @@ __all__ = [
     "StateSpaceFiltersError",
 ]
 
-# Files between a warning and the line of the user: the package, and its decorators.
-INSIDE = (str(Path(__file__).parent), contextlib.__file__, functools.__file__)
+# Files between a warning and the line of the user: the package, and its decorators. Python 3.13
+# compares prefixes with a name without its last letter, so these are shorter than the whole name.
+INSIDE = (
+    str(Path(__file__).parent),
+    *(name.removesuffix(".py") for name in (contextlib.__file__, functools.__file__)),
+)
 
 
 def warn(text: str, kind: type[Warning], *between: str) -> None:
