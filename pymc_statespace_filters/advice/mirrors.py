@@ -63,15 +63,21 @@ def mirror_sentence(model: Model, mirror: Mirror) -> str:
     if len(turned) > _MOST_NAMED:
         turned[_MOST_NAMED:] = [f"{len(turned) - _MOST_NAMED} others"]
     signs = f"signs of {joined(turned)} turned together" if others else f"sign of {first} turned"
-    prior = "pm.HalfNormal"
+    cure = f"give {first}, which is clear of zero, a prior of one sign (pm.HalfNormal)"
     if first.endswith("]"):
-        prior = (
+        cure = cure.removesuffix("pm.HalfNormal)") + (
             "in a vector pm.TruncatedNormal with lower=0 for it and -np.inf for the others, and "
-            "default_transform=None"
+            "default_transform=None)"
+        )
+    if not mirror.is_clear:
+        cure = (
+            "none of them is clear of zero, so give a sign to something else that turns, as the "
+            "slope of a field in a state that is not measured "
+            '(pm.Potential("one", pm.math.switch(slope > 0, 0.0, -np.inf)))'
         )
     return (
         f"{where} two mirror images of the posterior: its density is the same with the {signs}, so "
-        f"that {so}; give {first}, which is clear of zero, a prior of one sign ({prior})"
+        f"that {so}; {cure}"
     )
 
 

@@ -111,7 +111,7 @@ def test_a_search_ends_with_its_time():
 def test_where_the_chains_are(share, begin):
     with pm.Model() as model:
         pm.Normal("f", shape=20)
-    mirror = Mirror(np.arange(19)[::-1], np.array(share, dtype=float), np.zeros((4, 2, 20)))
+    mirror = Mirror(np.arange(19)[::-1], True, np.array(share, dtype=float), np.zeros((4, 2, 20)))
     text = mirror_sentence(model, mirror)
     assert text.startswith(
         f"{begin}{IMAGES} f[18], f[17], f[16], f[15], f[14], f[13] and 13 others"
@@ -119,10 +119,19 @@ def test_where_the_chains_are(share, begin):
     assert "give f[18], which is clear of zero, a prior of one sign (in a vector" in text
 
 
+def test_a_field_without_a_clear_coefficient_has_another_cure():
+    with pm.Model() as model:
+        pm.Normal("f", shape=20)
+    mirror = Mirror(np.arange(19), False, np.zeros(4), np.zeros((4, 2, 20)))
+    text = mirror_sentence(model, mirror)
+    assert "none of them is clear of zero" in text
+    assert "slope > 0" in text
+
+
 def test_a_single_sign_of_both_kinds_has_the_words_of_scales():
     with pm.Model() as model:
         pm.Normal("s")
-    mirror = Mirror(np.array([0]), np.array([0.0, 0.5]), np.zeros((2, 2, 1)))
+    mirror = Mirror(np.array([0]), True, np.array([0.0, 0.5]), np.zeros((2, 2, 1)))
     assert mirror_sentence(model, mirror).startswith("the density is the same at s and -s, and 25%")
 
 
@@ -140,10 +149,12 @@ def test_chains_are_compared_in_one_image():
     draws = folded * np.array([1, -1, 1, 1])[:, np.newaxis, np.newaxis]
     fact = Run(convergence(list(draws)), draws.reshape(-1, 1))
     assert fact.convergence.rhat[0] > 1.5
-    split = in_one_image(fact, [Mirror(np.array([0]), np.array([0.0, 1.0, 0.0, 0.0]), folded)])
+    split = in_one_image(
+        fact, [Mirror(np.array([0]), True, np.array([0.0, 1.0, 0.0, 0.0]), folded)]
+    )
     assert split.convergence.rhat[0] < 1.01
     np.testing.assert_array_equal(split.positions, folded.reshape(-1, 1))
-    assert in_one_image(fact, [Mirror(np.array([0]), np.ones(4), folded)]) is fact
+    assert in_one_image(fact, [Mirror(np.array([0]), True, np.ones(4), folded)]) is fact
 
 
 @pytest.mark.parametrize("prior", [pm.Normal, pm.HalfNormal])

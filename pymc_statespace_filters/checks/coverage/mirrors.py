@@ -14,9 +14,13 @@ from numpy.typing import NDArray
 
 from .copies import DIP
 
-N_FOUND, N_PROVED = 2, 8  # draws by which signs are found, and by which they are proved
+# Draws by which signs are found, by which they are proved, and of which the image is seen.
+N_FOUND, N_PROVED, N_SIDES = 2, 8, 200
 SAME = 1e-8  # relative difference of the log-densities of images, by rounding
-APART, LEAST = 0.2, 0.02  # of the median size, if fewer of the draws are nearer to zero
+LEAST, NEAR = 0.02, 1.0  # so few draws are nearer to the middle between images, in nats
+CLEAR = 2.5  # mean size in standard deviations; of a normal distribution around zero it is 1.3
+TINY = 1e-100  # in place of zero
+MOST_FAILED = 10  # searches from one element that the density has not ended at once
 SIDE = 0.02  # of the draws in the rarer image, at least, if they are in both
 
 Array = NDArray[np.float64]
@@ -28,6 +32,7 @@ class Mirror(NamedTuple):
     """Two images of a posterior that are apart."""
 
     turned: NDArray[np.int64]  # elements whose signs differ between them, the clearest first
+    is_clear: bool  # whether the first of these is clear of zero
     share: Array  # (chain,), of the draws of each chain that are in one of them
     folded: Array  # (chain, draw, k), all draws in the other one; also of mirrors found before
 
@@ -40,41 +45,64 @@ class Mirror(NamedTuple):
 def mirrors_of(draws: Array, symmetric: NDArray[np.bool_], evaluate: Density) -> Iterator[Mirror]:
     """The mirrors of a posterior with draws (chain, draw, k); signs of ``symmetric`` (k,) may turn.
 
-    One of the elements that turn has to stay away from zero.
+    In which image a draw is, relative to another one, is seen half way to this and to its image.
     """
-    found, sizes = set[int](), np.abs(draws).reshape(-1, draws.shape[-1])
-    clear = np.quantile(sizes, LEAST, axis=0) / np.maximum(np.median(sizes, axis=0), 1e-300)
-    x = draws.reshape(sizes.shape)[np.linspace(0, len(sizes) - 1, N_PROVED).astype(int)]
-    for first in np.argsort(-clear):
-        if first in found or not symmetric[first] or clear[first] < APART:
+    found, n_failed = set[int](), 0
+    flat = draws.reshape(-1, draws.shape[-1])
+    few, some = (flat[np.linspace(0, len(flat) - 1, n).astype(int)] for n in (N_PROVED, N_SIDES))
+    for first in np.argsort(-_clear(draws)):
+        if first in found or not symmetric[first] or n_failed == MOST_FAILED:
             continue
-        signs = _signs(x[:: N_PROVED // N_FOUND], first, symmetric, evaluate)
-        if signs is None or not _are_same(evaluate(signs * x), at_x := evaluate(x)).all():
+        signs, n_sweeps = _signs(few[:N_FOUND], first, symmetric, evaluate)
+        n_failed += signs is None and n_sweeps > 0
+        if signs is None or not _are_same(evaluate(signs * few), at_few := evaluate(few)).all():
             continue
-        is_image = draws[..., first] < 0
+        best = few[at_few.argmax()]
+        side = _sides(some, best, signs, evaluate)
+        low, middle = np.quantile(np.abs(side), [LEAST, 0.5])
+        if low < NEAR or middle < DIP:  # one mode around zero
+            continue
+        is_image = np.zeros(draws.shape[:2], dtype=bool)
+        if (side < 0).any():
+            side = _sides(draws.reshape(flat.shape), best, signs, evaluate)
+            is_image = (side < 0).reshape(is_image.shape)
         folded = np.where(is_image[..., np.newaxis], signs * draws, draws)
-        ends = np.stack([folded.mean(axis=(0, 1)), x[at_x.argmax()]])
-        # Images that are not apart are one mode around zero.
-        if (evaluate(np.where(signs < 0, 0.0, ends)) < evaluate(ends) - DIP).any():
-            turned = np.flatnonzero(signs < 0)
-            turned = turned[np.argsort(-clear[turned], kind="stable")]
-            yield Mirror(turned, is_image.mean(axis=1), folded)
-            found.update(turned.tolist())
-            draws, symmetric = folded, symmetric & (np.arange(len(symmetric)) != first)
+        clear, turned = _clear(folded), np.flatnonzero(signs < 0)
+        turned = turned[np.argsort(-clear[turned], kind="stable")]
+        yield Mirror(turned, bool(clear[turned[0]] > CLEAR), is_image.mean(axis=1), folded)
+        found.update(turned.tolist())
+        draws, symmetric = folded, symmetric & (np.arange(len(symmetric)) != first)
 
 
-def _signs(x: Array, first: int, symmetric: NDArray[np.bool_], evaluate: Density) -> Array | None:
+def _clear(draws: Array) -> Array:
+    """By how many standard deviations (k,) the sizes of elements are clear of zero."""
+    sizes = np.abs(draws).reshape(-1, draws.shape[-1])
+    return np.asarray(sizes.mean(axis=0) / np.maximum(sizes.std(axis=0), TINY))
+
+
+def _sides(x: Array, reference: Array, signs: Array, evaluate: Density) -> Array:
+    """How much nearer, in nats, points (m, k) are to a reference than to its image."""
+    here, there = (evaluate((x + end) / 2) for end in (reference, signs * reference))
+    with np.errstate(invalid="ignore"):  # both may be -inf
+        return np.nan_to_num(here - there)
+
+
+def _signs(
+    x: Array, first: int, symmetric: NDArray[np.bool_], evaluate: Density
+) -> tuple[Array | None, int]:
     """The signs (k,) of the mirror in which an element turns, from points (m, k), if there is one.
 
-    A sign that the density does not tell is kept, as of another mirror.
+    And the number of sweeps over the other elements. A sign that the density does not tell is kept,
+    as of another mirror.
     """
-    k, n_kept = x.shape[1], 1
+    k, n_kept, n_sweeps = x.shape[1], 1, 0
     signs, known = np.ones(k), ~symmetric
     signs[first], known[first] = -1.0, True
     start = np.where(known, x, 0.0)
     if not _are_same(evaluate(signs * start), evaluate(start)).all():
-        return None
+        return None, n_sweeps
     while not known.all():
+        n_sweeps += 1
         others = np.flatnonzero(~known)
         one = np.eye(k, dtype=bool)[others][:, np.newaxis]  # (other, 1, k), beside the known ones
         points = np.where(known | one, x, 0.0)
@@ -82,15 +110,16 @@ def _signs(x: Array, first: int, symmetric: NDArray[np.bool_], evaluate: Density
         at, *of_images = (evaluate(y.reshape(-1, k)).reshape(len(others), -1) for y in images)
         keeps, turns = (_are_same(values, at).all(axis=1) for values in of_images)
         if not (keeps | turns).all():
-            return None
+            return None, n_sweeps
         told = keeps != turns
         if not told.any():
             told[:n_kept] = True
             n_kept *= 2
         signs[others[told & ~keeps]] = -1.0
         known[others[told]] = True
-    return signs
+    return signs, n_sweeps
 
 
 def _are_same(a: Array, b: Array) -> NDArray[np.bool_]:
-    return (a == b) | (np.abs(a - b) <= SAME * (1 + np.abs(b)))
+    with np.errstate(invalid="ignore"):
+        return (a == b) | (np.abs(a - b) <= SAME * (1 + np.abs(b)))
