@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-KNOWN = 4130  # functions that numba compiles in all tests, in two processes on an empty cache
+KNOWN = 3770  # functions that numba compiles in all tests, in two processes on an empty cache
 MOST = 1.1 * KNOWN
 MEMORY = Path("/proc/self/statm")  # of Linux alone
 
