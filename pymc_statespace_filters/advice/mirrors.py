@@ -18,6 +18,7 @@ from ..tables import joined
 from .signs import sign_text
 
 _MOST_NAMED = 6  # elements
+_AT_ONCE = 64  # points, after which the time is looked at
 _ALL = 0.95  # of the draws of a chain, that is said to be in an image
 
 Array = NDArray[np.float64]
@@ -28,9 +29,12 @@ def mirrors_within(seconds: float, model: Model, draws: Array, evaluate: Density
     end, found = time.process_time() + seconds, list[Mirror]()
 
     def in_time(x: Array) -> Array:
-        if time.process_time() > end:
-            raise TimeoutError
-        return evaluate(x)
+        parts = list[Array]()
+        for first in range(0, len(x), _AT_ONCE):
+            if time.process_time() > end:
+                raise TimeoutError
+            parts.append(evaluate(x[first : first + _AT_ONCE]))
+        return np.concatenate(parts)
 
     with suppress(TimeoutError):
         for mirror in mirrors_of(draws, _have_signs(model, draws[0, -1]), in_time):

@@ -99,6 +99,17 @@ def test_a_search_ends_with_its_time():
     assert mirrors_within(-1.0, model, near(TRUTH, model), ModelDensity(model).evaluate) == []
 
 
+def test_the_time_of_a_search_is_looked_at_between_few_points():
+    sizes, model = [], model_of()
+
+    def evaluate(x):
+        sizes.append(len(x))
+        return ModelDensity(model).evaluate(x)
+
+    assert mirrors_within(np.inf, model, near(TRUTH, model), evaluate)
+    assert max(sizes) == 64
+
+
 @pytest.mark.parametrize(
     ("share", "begin"),
     [

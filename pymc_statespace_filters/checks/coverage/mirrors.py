@@ -63,9 +63,13 @@ def mirrors_of(draws: Array, symmetric: NDArray[np.bool_], evaluate: Density) ->
         if low < NEAR or middle < DIP:  # one mode around zero
             continue
         is_image = np.zeros(draws.shape[:2], dtype=bool)
-        if (side < 0).any():
-            side = _sides(draws.reshape(flat.shape), best, signs, evaluate)
-            is_image = (side < 0).reshape(is_image.shape)
+        if (is_other := side < 0).any():
+            tell = (((some < 0) != (best < 0)) == is_other[:, np.newaxis]).all(axis=0) & (signs < 0)
+            votes = (draws < 0)[..., tell] != (best < 0)[tell]
+            is_image = votes.all(axis=-1)
+            unsure = is_image != votes.any(axis=-1)  # all draws, where no single sign tells
+            if unsure.any():
+                is_image[unsure] = _sides(draws[unsure], best, signs, evaluate) < 0
         folded = np.where(is_image[..., np.newaxis], signs * draws, draws)
         clear, turned = _clear(folded), np.flatnonzero(signs < 0)
         turned = turned[np.argsort(-clear[turned], kind="stable")]
