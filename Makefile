@@ -79,7 +79,7 @@ lint: $(VENV)/.installed  ## check style, format, types and import layers
 
 docs: $(VENV)/.installed  ## build the guide in docs/_build/html; takes half a minute, up to 16 if pages run: after changes of the package, or EXECUTE=force
 	@echo "Building the guide in docs/_build/html, which takes half a minute of CPU time (AMD EPYC)."
-	@echo "Pages without stored results run first: all of them take 12 to 20 minutes of CPU time."
+	@echo "Pages without stored results run first: all of them take 20 to 30 minutes of CPU time."
 	$(IN)/python -m sphinx -E -j 2 -D nb_execution_mode=$(EXECUTE) -W --keep-going --quiet -b html docs docs/_build/html
 
 linkcheck: $(VENV)/.installed  ## check the guide's links to other sites; needs network access
